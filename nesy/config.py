@@ -1,0 +1,63 @@
+"""Settings of the steps that make a symbolic model: plain dataclasses, cheap to import.
+
+Every field's docstring is its help text on the command line.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class CollectConfig:
+    """What experience to collect."""
+
+    crossing_episodes: int = 3000
+    """Episodes on the crossing task, half of them random and half by the A* expert."""
+    following_episodes: int = 3000
+    """Episodes of person following, for what is to be learned about the person and the rewards."""
+    following_mixture: float = 0.5
+    """Probability that the switching behaviour of the following episodes takes a random action."""
+    num_envs: int = 256
+    """Environments stepped at once."""
+    shard_episodes: int = 1000
+    """Episodes in one Parquet file: the unit in which collection is resumed."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How the world model is trained."""
+
+    architecture: Literal["symbolic", "paper"] = "symbolic"
+    """`symbolic`: made so that the extracted table loses nothing; `paper`: as published."""
+    epochs: int = 60
+    """Passes over the data, as an upper limit: training stops early once every gate holds."""
+    batch_size: int = 500
+    """Transitions in one mini-batch."""
+    learning_rate: float = 1e-2
+    """Adam's step size at the start."""
+    learning_rate_decay: float = 0.9
+    """Factor on the step size after every epoch."""
+    temperature: float = 0.6
+    """Gumbel-softmax temperature (annealed by the `symbolic` architecture)."""
+    kl_weight: float = 0.1
+    """Weight of the KL to the uniform prior."""
+    max_parents: int = 4
+    """Most parents from slice t that a factor may have under one action."""
+    intra_slice_arcs: bool = True
+    """Whether earlier factors of slice t+1 may be parents too."""
+    held_out: float = 0.2
+    """Share of the maps kept out of training for the gates."""
+    time_limit: float = 180.0
+    """Seconds after which training ends with the best model so far; 0 for no limit."""
+    device: str = "cpu"
+    """Where to train: `cpu`, `cuda`, `cuda:1`, ..."""
+
+
+@dataclass(frozen=True)
+class ExtractConfig:
+    """How the 2DBN is extracted."""
+
+    prior_count: float = 0.0
+    """Dirichlet count added to every row entry when rows are counted from experience."""
