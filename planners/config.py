@@ -1,0 +1,150 @@
+"""Settings of the planners and of their comparison: plain dataclasses, cheap to import.
+
+Every field's docstring is its help text on the command line.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+INFLUENCE_MODES = ("zero", "random", "egocentric", "perspective-shift", "perfect-information")
+INPUT_SETS = ("paper", "full")
+LEARNING_AGENTS = ("dqn",)
+PLANNING_AGENTS = ("pomdp", "search")
+REFERENCE_AGENTS = ("greedy-follower", "greedy-last-seen", "random", "optimum")
+AGENTS = LEARNING_AGENTS + PLANNING_AGENTS + REFERENCE_AGENTS
+
+
+@dataclass(frozen=True)
+class DQNConfig:
+    """How the belief DQN learns."""
+
+    episodes: int = 6000
+    """Training episodes (the batch finishes the ones it has begun)."""
+    num_envs: int = 64
+    """Environments stepped at once."""
+    hidden: tuple[int, ...] = (256, 256)
+    """Widths of the hidden layers."""
+    dueling: bool = True
+    """Whether value and advantage have heads of their own."""
+    layer_norm: bool = True
+    """Whether hidden layers are normalised."""
+    learning_rate: float = 1e-3
+    """Adam's step size at the start."""
+    final_learning_rate: float = 1e-4
+    """Adam's step size at the end (linear in between)."""
+    batch_size: int = 256
+    """Transitions in one update."""
+    memory: int = 60_000
+    """Transitions kept for replay."""
+    discount: float = 0.9
+    """Discount per step."""
+    n_step: int = 3
+    """Steps of reward before the value estimate takes over."""
+    warm_up: int = 2000
+    """Environment steps before the first update."""
+    updates_per_step: float = 0.05
+    """Gradient steps per environment step."""
+    epsilon_start: float = 0.7
+    """Probability of a random action at the start."""
+    epsilon_end: float = 0.02
+    """Probability of a random action at the end."""
+    epsilon_decay: float = 0.2
+    """Time constant of the decay of the exploration, as a share of all episodes."""
+    tau: float = 0.02
+    """Share by which the target network moves towards the network per update."""
+    gradient_clip: float = 10.0
+    """Largest norm of the gradient."""
+    reward_scale: float = 0.1
+    """Rewards are multiplied by this before learning."""
+    double: bool = True
+    """Whether the online network chooses the action that the target network values."""
+    prioritised: bool = False
+    """Whether replay prefers transitions with a large error."""
+    published_terminals: bool = False
+    """As the published code: bootstrap from terminal transitions as if the episode went on."""
+    published_target_start: bool = False
+    """As the published code: the target network starts from other weights than the network."""
+    published_sampling: bool = False
+    """As the published code: beliefs are sampled codes (Gumbel noise) rather than probabilities."""
+
+    @classmethod
+    def paper(cls, episodes: int = 10_000) -> DQNConfig:
+        """The settings of the paper: one environment, one update per step."""
+        return cls(
+            episodes=episodes,
+            num_envs=1,
+            hidden=(500, 500),
+            dueling=False,
+            layer_norm=False,
+            learning_rate=1e-3,
+            final_learning_rate=1e-3,
+            batch_size=64,
+            memory=60_000,
+            discount=0.9,
+            n_step=1,
+            warm_up=1000,
+            updates_per_step=1.0,
+            epsilon_start=0.7,
+            epsilon_end=0.01,
+            epsilon_decay=0.2,
+            tau=0.005,
+            gradient_clip=10.0,
+            reward_scale=1.0,
+        )
+
+    @classmethod
+    def fast(cls, episodes: int = 6000) -> DQNConfig:
+        """The settings that learn best per second here: many environments, few large updates."""
+        return cls(episodes=episodes)
+
+
+@dataclass(frozen=True)
+class SearchConfig:
+    """How the planners search."""
+
+    simulations: int = 300
+    """Simulations per decision."""
+    time_limit: float = 0.0
+    """Seconds per decision after which the search stops early; 0 for no limit (and repeatable results)."""
+    depth: int = 12
+    """Deepest step looked ahead."""
+    discount: float = 0.9
+    """Discount per step."""
+    exploration: float = 10.0
+    """Weight of the exploration term (UCB1), in units of reward."""
+    particles: int = 400
+    """Particles of the belief over (x, y, c, counters)."""
+    pomdp_py_simulations: int = 60
+    """Simulations per decision of pomdp-py's POUCT, which is far slower per simulation."""
+
+
+@dataclass(frozen=True)
+class CompareConfig:
+    """What is compared: the grid of agents x input sets x influence modes x variants x seeds."""
+
+    agents: tuple[str, ...] = ("dqn", "pomdp", "search", "greedy-follower", "greedy-last-seen", "random", "optimum")
+    """Which agents: dqn, pomdp (pomdp-py), search, greedy-follower, greedy-last-seen, random, optimum."""
+    inputs: tuple[str, ...] = ("full",)
+    """Input sets of the DQN: paper (b, b~) or full (b, b~ and the configuration)."""
+    influences: tuple[str, ...] = ("random", "perspective-shift", "perfect-information")
+    """Influence modes: zero, random, egocentric, perspective-shift, perfect-information."""
+    variants: tuple[str, ...] = ("paper",)
+    """Variants of the task."""
+    seeds: tuple[int, ...] = (0,)
+    """Seeds; every cell is run once per seed."""
+    episodes: int = 168
+    """Evaluation episodes per seed (the same maps and seeds for all; on `paper` a multiple of its 42 maps)."""
+    planner_episodes: int = 42
+    """Evaluation episodes per seed for the agents that search (`pomdp` and `search`)."""
+    confidence: float = 0.95
+    """Coverage of the intervals."""
+    engine: Literal["local", "ray"] = "local"
+    """Where the cells run: processes on this machine, or a Ray cluster."""
+    address: str = ""
+    """Address of the Ray cluster (engine ray); empty starts one here."""
+    dqn: DQNConfig = field(default_factory=DQNConfig.fast)
+    """How the DQN learns."""
+    search: SearchConfig = field(default_factory=SearchConfig)
+    """How the planners search."""
