@@ -1,0 +1,222 @@
+"""Experience: transitions in columns, one row per step, in Parquet files that are written in shards.
+
+A folder of experience holds `part-*.parquet`; every part has the columns of `SCHEMA`. Views are flattened in
+C order of `[vx, vy]` and given back as `[n, 5, 5]`. Nothing is ever pickled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from nesy.errors import UserError
+from nesy.run_folder import atomic_path
+
+SOURCES = ("crossing-random", "crossing-expert", "following-random", "following-expert", "following-mixture")
+"""Who acted, in which task; the column `source` holds one of these."""
+
+_VIEWS = ("view", "next_view", "person_view", "next_person_view")
+_POSES = ("relative_pose", "next_relative_pose")
+_SCALARS: dict[str, type[np.generic]] = {
+    "episode": np.int64,
+    "t": np.int32,
+    "map_id": np.int64,
+    "configuration": np.int16,
+    "next_configuration": np.int16,
+    "waiting": np.int16,
+    "lost": np.int16,
+    "action": np.int8,
+    "person_action": np.int8,
+    "reward": np.float32,
+    "terminated": np.bool_,
+    "truncated": np.bool_,
+    "outcome": np.int8,
+    "distance": np.float32,
+    "visible": np.bool_,
+}
+
+
+@dataclass(frozen=True)
+class Experience:
+    """Transitions as a struct of arrays; row i of every array is one step.
+
+    `view`, `next_view`, `person_view`, `next_person_view`: uint8 `[n, V, V]`; `relative_pose`,
+    `next_relative_pose`: int16 `[n, 3]`; everything else `[n]`. `source` holds strings of `SOURCES`.
+    """
+
+    episode: np.ndarray
+    t: np.ndarray
+    source: np.ndarray
+    map_id: np.ndarray
+    view: np.ndarray
+    configuration: np.ndarray
+    relative_pose: np.ndarray
+    waiting: np.ndarray
+    lost: np.ndarray
+    person_view: np.ndarray
+    action: np.ndarray
+    person_action: np.ndarray
+    reward: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    outcome: np.ndarray
+    distance: np.ndarray
+    visible: np.ndarray
+    next_view: np.ndarray
+    next_configuration: np.ndarray
+    next_relative_pose: np.ndarray
+    next_person_view: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.action)
+
+    @classmethod
+    def load(cls, folder: Path | str, sources: Iterable[str] | None = None) -> Experience:
+        """Read every part of `folder`, in the order of the file names.
+
+        Args:
+            folder: where the parts lie.
+            sources: only rows of these sources (names of `SOURCES`); None for all.
+
+        Raises:
+            UserError: no folder, no parts, a damaged part, or an unknown source.
+        """
+        folder = Path(folder)
+        wanted = None if sources is None else set(sources)
+        if wanted is not None and not wanted <= set(SOURCES):
+            raise UserError(
+                f"unknown experience source {sorted(wanted - set(SOURCES))}; known: {', '.join(SOURCES)}"
+            )
+        parts = sorted(folder.glob("part-*.parquet"))
+        if not parts:
+            raise UserError(f"{folder}: no experience here (no part-*.parquet); make it with: nesy collect")
+        loaded = [columns for part in parts if (columns := _read_part(part, wanted)) is not None]
+        if not loaded:
+            raise UserError(f"{folder}: no transitions of the sources {sorted(wanted or ())}")
+        return cls(**{name: np.concatenate([columns[name] for columns in loaded]) for name in loaded[0]})
+
+    def select(self, mask: np.ndarray) -> Experience:
+        """The rows that `mask` (bool `[n]` or an index array) picks, in that order."""
+        return Experience(**{field.name: getattr(self, field.name)[mask] for field in fields(self)})
+
+    def split_by_map(self, fraction: float, rng: np.random.Generator) -> tuple[Experience, Experience]:
+        """Split into experience of some maps and of the others.
+
+        Args:
+            fraction: share of the distinct maps that goes to the second part; at least one map stays in the
+                first part, and a positive fraction takes at least one where there are two or more.
+            rng: draws the maps.
+
+        Returns:
+            `(train, held_out)`; no map is in both.
+
+        Raises:
+            UserError: `fraction` is outside [0, 1).
+        """
+        held_out = self.held_out_maps(fraction, rng)
+        return self.select(~held_out), self.select(held_out)
+
+    def held_out_maps(self, fraction: float, rng: np.random.Generator) -> np.ndarray:
+        """Bool `[n]`: rows of the maps that `split_by_map` would put into its second part."""
+        if not 0 <= fraction < 1:
+            raise UserError(f"the held-out share of the maps must be in [0, 1), not {fraction}")
+        maps = np.unique(self.map_id)
+        count = min(len(maps) - 1, max(1, round(fraction * len(maps)))) if fraction > 0 else 0
+        return np.isin(self.map_id, rng.permutation(maps)[:count])
+
+
+COLUMNS = tuple(field.name for field in fields(Experience))
+
+
+def schema(cells: int) -> pa.Schema:
+    """The Parquet schema for views of `cells` cells."""
+    types = {"source": pa.dictionary(pa.int8(), pa.string())}
+    types |= {name: pa.from_numpy_dtype(dtype) for name, dtype in _SCALARS.items()}
+    types |= {name: pa.list_(pa.uint8(), cells) for name in _VIEWS}
+    types |= {name: pa.list_(pa.int16(), 3) for name in _POSES}
+    return pa.schema([(name, types[name]) for name in COLUMNS])
+
+
+def write_part(path: Path, columns: Mapping[str, np.ndarray | Sequence[str]]) -> int:
+    """Write one part atomically.
+
+    Args:
+        path: `part-*.parquet`.
+        columns: every name of `COLUMNS`, with the shapes of `Experience`.
+
+    Returns:
+        The number of rows.
+    """
+    assert set(columns) == set(COLUMNS), sorted(set(columns) ^ set(COLUMNS))
+    rows = len(columns["action"])
+    cells = int(np.prod(np.shape(columns["view"])[1:]))
+    arrays = []
+    for name in COLUMNS:
+        values = np.asarray(columns[name])
+        assert len(values) == rows, f"{name}: {len(values)} rows, not {rows}"
+        if name == "source":
+            arrays.append(
+                pa.array(values.astype(object)).dictionary_encode().cast(schema(cells).field(name).type)
+            )
+        elif name in _VIEWS:
+            flat = np.ascontiguousarray(values.reshape(rows * cells), dtype=np.uint8)
+            arrays.append(pa.FixedSizeListArray.from_arrays(pa.array(flat), cells))
+        elif name in _POSES:
+            flat = np.ascontiguousarray(values.reshape(rows * 3), dtype=np.int16)
+            arrays.append(pa.FixedSizeListArray.from_arrays(pa.array(flat), 3))
+        else:
+            arrays.append(pa.array(values.astype(_SCALARS[name])))
+    with atomic_path(path) as temporary:
+        pq.write_table(pa.Table.from_arrays(arrays, schema=schema(cells)), temporary, compression="zstd")
+    return rows
+
+
+def count_rows(path: Path) -> int | None:
+    """Rows of a part, from its footer; None if the file is missing or not a readable part."""
+    try:
+        metadata = pq.read_metadata(path)
+        names = set(pq.read_schema(path).names)
+    except (OSError, pa.ArrowException):
+        return None
+    return int(metadata.num_rows) if names == set(COLUMNS) else None
+
+
+def _read_part(path: Path, sources: set[str] | None) -> dict[str, np.ndarray] | None:
+    try:
+        # Read from an open file: a path would be taken for a data set and its folder names for columns.
+        with path.open("rb") as stream:
+            table = pq.read_table(stream)
+    except (OSError, pa.ArrowException) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UserError(
+            f"{path}: damaged, cannot be read as Parquet ({reason}); delete it, collect again"
+        ) from None
+    missing = [name for name in COLUMNS if name not in table.column_names]
+    if missing:
+        raise UserError(f"{path}: not a part of experience, columns missing: {', '.join(missing)}")
+    cells = getattr(table.schema.field("view").type, "list_size", 0)
+    side = round(cells**0.5)
+    if side * side != cells or not cells or not table.select(list(COLUMNS)).schema.equals(schema(cells)):
+        raise UserError(f"{path}: not a part of experience, its columns have other types than expected")
+    source = np.asarray(table["source"].cast(pa.string()).to_numpy(zero_copy_only=False), dtype=str)
+    keep = None if sources is None else np.isin(source, sorted(sources))
+    if keep is not None and not keep.any():
+        return None
+    columns: dict[str, np.ndarray] = {}
+    for name in COLUMNS:
+        if name == "source":
+            values = source.astype("U20")
+        elif name in _VIEWS or name in _POSES:
+            values = table[name].combine_chunks().flatten().to_numpy(zero_copy_only=False)
+            values = values.reshape(-1, side, side) if name in _VIEWS else values.reshape(-1, 3)
+        else:
+            values = table[name].to_numpy()
+        if len(values) != len(source):
+            raise UserError(f"{path}: damaged, column {name} has missing values")
+        columns[name] = values if keep is None else values[keep]
+    return columns
