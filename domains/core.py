@@ -73,9 +73,9 @@ class ViewGeometry:
         """
         x, y, h = (np.asarray(part, dtype=np.int64) for part in (vx, vy, heading))
         if ((x < 0) | (x >= self.view_size) | (y < 0) | (y >= self.view_size)).any():
-            raise DomainError(f"view coordinates must be in 0..{self.view_size - 1}, got ({vx}, {vy})")
+            raise DomainError(f"view coordinates must be in 0..{self.view_size - 1}, got ({vx!r}, {vy!r})")
         if ((h < 0) | (h > 3)).any():
-            raise DomainError(f"a relative heading must be in 0..3, got {heading}")
+            raise DomainError(f"a relative heading must be in 0..3, got {heading!r}")
         return np.asarray(1 + (x * self.view_size + y) * 4 + h)
 
     def decode(
@@ -88,7 +88,8 @@ class ViewGeometry:
         """
         value = np.asarray(configuration, dtype=np.int64)
         if ((value < 0) | (value >= self.num_configurations)).any():
-            raise DomainError(f"a configuration must be in 0..{self.num_configurations - 1}, got {configuration}")
+            largest = self.num_configurations - 1
+            raise DomainError(f"a configuration must be in 0..{largest}, got {configuration!r}")
         pose = value - 1
         unseen = value == 0
         vx = np.where(unseen, -1, pose // 4 // self.view_size)
@@ -96,7 +97,7 @@ class ViewGeometry:
         return vx, vy, np.where(unseen, -1, pose % 4)
 
     def relative(self, configuration: ArrayLike) -> NDArray[np.int64]:
-        """(side, ahead, heading) `[..., 3]` of configurations: side to the right, ahead forward; -1s if unseen."""
+        """(side to the right, steps ahead, heading) `[..., 3]` of configurations; -1s where unseen."""
         vx, vy, heading = self.decode(configuration)
         unseen = heading < 0
         side = np.where(unseen, -1, vx - self.view_size // 2)
@@ -126,12 +127,12 @@ class DomainSpec:
 class BatchedEnvironment(Protocol):
     """A `gymnasium.vector.VectorEnv` (SAME_STEP autoreset) with what a learner of minds may ask besides.
 
-    The observation is a dict: `view` uint8 `[B, v, v]` and `configuration` int64 `[B]`. `infos` of a step hold
-    arrays `[B]` that describe the step just taken, before any reset: `outcome` (a name of `OUTCOMES`),
+    The observation is a dict: `view` uint8 `[B, v, v]` and `configuration` int64 `[B]`. `infos` of a step
+    hold arrays `[B]` that describe the step just taken, before any reset: `outcome` (a name of `OUTCOMES`),
     `outcome_code`, `distance`, `visible`, `person_action`, `person_waited`; and `final_obs`,
-    `final_person_view`, `final_relative_pose`, `final_counters`: what held after the step and before the reset,
-    for EVERY environment (where no episode ended they equal the present values), with the mask `_final_obs` of
-    the environments that were reset. After an autoreset all methods describe the new episode.
+    `final_person_view`, `final_relative_pose`, `final_counters`: what held after the step and before the
+    reset, for EVERY environment (where no episode ended they equal the present values), with the mask
+    `_final_obs` of the environments that were reset. After an autoreset all methods describe the new episode.
     """
 
     num_envs: int
@@ -159,7 +160,7 @@ class BatchedEnvironment(Protocol):
         ...
 
     def person_actions(self) -> NDArray[np.int8]:
-        """`[B]`: what the person did in the last step (0 left, 1 right, 2 forward, 3 wait); -1 after a reset."""
+        """`[B]`: the person's last action (0 left, 1 right, 2 forward, 3 wait); -1 after a reset."""
         ...
 
     def counters(self) -> NDArray[np.int16]:
@@ -167,7 +168,7 @@ class BatchedEnvironment(Protocol):
         ...
 
     def expert_actions(self, kind: str) -> NDArray[np.int64]:
-        """`[B]`: first action of the A* path on the full map, to the `goal` or, as a `follower`, to the person."""
+        """`[B]`: first action of the A* path on the full map, to the `goal` or (`follower`) to the person."""
         ...
 
     def map_ids(self) -> NDArray[np.int64]:
@@ -253,7 +254,9 @@ class Domain(Protocol):
         """
         ...
 
-    def maps(self, variant: str = "paper", **parameters: Any) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    def maps(
+        self, variant: str = "paper", **parameters: Any
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
         """The distinct maps `[M, size, size]` and the generator's probabilities `[M]`.
 
         Raises:
