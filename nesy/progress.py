@@ -66,7 +66,13 @@ class ConsoleProgress:
 @contextmanager
 def _bar(description: str, total: int) -> Iterator[Task]:
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
     from rich.progress import Progress as RichProgress
 
     columns = (
@@ -87,6 +93,7 @@ def _bar(description: str, total: int) -> Iterator[Task]:
             done = 0
 
             def advance(self, steps: int = 1, **metrics: float) -> None:
+                """Move the bar."""
                 self.done += steps
                 rate = self.done / max(time.monotonic() - started, 1e-9)
                 fields = {"rate": _rate(rate)}
@@ -108,6 +115,7 @@ class _LineTask:
         self.metrics: dict[str, float] = {}
 
     def advance(self, steps: int = 1, **metrics: float) -> None:
+        """Report `steps` more units done."""
         self.done += steps
         self.metrics.update(metrics)
         if time.monotonic() - self.printed >= self.interval:
@@ -119,13 +127,14 @@ class _LineTask:
         rate = self.done / seconds
         left = (self.total - self.done) / rate if rate > 0 else float("inf")
         print(
-            f"{self.description}: {self.done}/{self.total}  {_rate(rate)}  {seconds:.0f} s, {left:.0f} s left  "
-            f"{_metrics(self.metrics)}".rstrip(),
+            f"{self.description}: {self.done}/{self.total}  {_rate(rate)}  "
+            f"{seconds:.0f} s, {left:.0f} s left  {_metrics(self.metrics)}".rstrip(),
             file=sys.stderr,
             flush=True,
         )
 
     def close(self) -> None:
+        """Print the last line."""
         self._print()
 
 

@@ -1,0 +1,38 @@
+"""Collect experience: random and expert episodes of the crossing task, and person-following episodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
+
+import tyro
+
+from nesy.cli import pipeline, tables
+from nesy.cli.configuration import RunConfig
+from nesy.config import CollectConfig
+
+
+@dataclass(frozen=True)
+class Arguments(pipeline.CommonArguments):
+    """Options of `nesy collect`."""
+
+    settings: Annotated[CollectConfig, tyro.conf.arg(name="")] = CollectConfig()
+
+
+def defaults(arguments: list[str]) -> Arguments:
+    """The options' values where the command line says nothing."""
+    return Arguments(settings=pipeline.base_config(arguments).collect)
+
+
+def run(options: Arguments) -> dict[str, Any]:
+    """Collect into the run folder."""
+    base: RunConfig = pipeline.common_config(options, pipeline.config_of(options))
+    work = pipeline.Pipeline(options.run, replace(base, collect=options.settings), options.jobs)
+    with work.run.lock():
+        work.configure(redo_from="collect" if options.redo else None)
+        return work.collect()
+
+
+def show(result: dict[str, Any]) -> None:
+    """Print what was collected."""
+    tables.print_figures("experience", result)

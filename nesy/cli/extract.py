@@ -1,0 +1,79 @@
+"""Extract the symbolic 2DBN from the trained world model; print it, or write it in another format."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from nesy.cli import pipeline, tables
+from nesy.config import ExtractConfig
+from nesy.errors import UserError
+
+
+@dataclass(frozen=True)
+class Arguments(pipeline.CommonArguments):
+    """Options of `nesy extract`."""
+
+    table: bool = False
+    """Print the extracted table for reading (all of it, or what --factor and --action select)."""
+    factor: int | None = None
+    """Print the table of this factor only."""
+    action: str | None = None
+    """Print the table of this action only."""
+    to: Path | None = None
+    """Write the 2DBN to this file; the suffix tells the format unless --format does."""
+    format: str | None = None
+    """Format of --to."""
+    settings: Annotated[ExtractConfig, tyro.conf.arg(name="")] = ExtractConfig()
+
+
+def defaults(arguments: list[str]) -> Arguments:
+    """The options' values where the command line says nothing."""
+    return Arguments(settings=pipeline.base_config(arguments).extract)
+
+
+def run(options: Arguments) -> dict[str, Any]:
+    """Extract inside the run folder, then print and export as asked."""
+    base = pipeline.common_config(options, pipeline.config_of(options))
+    work = pipeline.Pipeline(options.run, replace(base, extract=options.settings), options.jobs)
+    with work.run.lock():
+        work.configure(redo_from="extract" if options.redo else None)
+        result = work.extract()
+    if options.to is not None:
+        result["exported"] = str(_export(work, options))
+    if options.table or options.factor is not None or options.action is not None:
+        result["table"] = _table(work, options)
+    return result
+
+
+def _export(work: pipeline.Pipeline, options: Arguments) -> Path:
+    from nesy import formats
+    from nesy.dbn import TwoSliceDBN
+
+    assert options.to is not None
+    formats.export(TwoSliceDBN.load(work.run.dbn), options.to, format=options.format)
+    return options.to
+
+
+def _table(work: pipeline.Pipeline, options: Arguments) -> str:
+    from nesy.dbn import TwoSliceDBN, describe
+
+    dbn = TwoSliceDBN.load(work.run.dbn)
+    if options.action is not None and options.action not in dbn.action_names:
+        raise UserError(f"--action {options.action}: no such action; the actions are {', '.join(dbn.action_names)}")
+    if options.factor is not None and not 0 <= options.factor < len(dbn.factor_names):
+        raise UserError(f"--factor {options.factor}: no such factor; the factors are 0 to {len(dbn.factor_names) - 1}")
+    action = None if options.action is None else dbn.action_names.index(options.action)
+    return describe(dbn, factor=options.factor, action=action)
+
+
+def show(result: dict[str, Any]) -> None:
+    """Print the table where asked for, the figures otherwise."""
+    table = result.pop("table", None)
+    if table is not None:
+        print(table)
+    else:
+        tables.print_figures("2DBN", result)

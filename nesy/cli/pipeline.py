@@ -1,0 +1,265 @@
+"""The pipeline: collect, train, extract, compare, report, each step resumable and done once.
+
+A finished step is not repeated. Asked to repeat it with other settings, the pipeline refuses unless told to
+redo it; redoing a step removes what was built on it.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from nesy.cli import configuration
+from nesy.cli.configuration import PRESETS, PresetName, RunConfig
+from nesy.errors import UserError
+from nesy.progress import ConsoleProgress, Progress
+from nesy.run_folder import RunFolder, write_json
+
+# What each step leaves in the run folder, in pipeline order: redoing a step removes its own and all later ones.
+OUTPUTS: dict[str, tuple[str, ...]] = {
+    "collect": ("experience",),
+    "train": ("world_model",),
+    "extract": ("dbn",),
+    "compare": ("ialm", "policies", "results"),
+    "report": ("report.html",),
+}
+LIBRARIES = ("torch", "numpy", "numba", "gymnasium", "minigrid", "pomdp-py", "clingo", "pyarrow", "scipy")
+
+
+@dataclass(frozen=True)
+class CommonArguments:
+    """Options that every step of the pipeline takes."""
+
+    run: Path = Path("runs/default")
+    """The run folder."""
+    preset: PresetName | None = None
+    """Settings to start from: smoke, quick or paper (default: those of the run, or quick for a new one)."""
+    variant: str | None = None
+    """Variant of the task (default: that of the run, or paper)."""
+    seed: int | None = None
+    """Seed of everything random (default: that of the run, or 0)."""
+    jobs: int = 2
+    """Processes for work that can be done side by side; the results do not depend on it."""
+    redo: bool = False
+    """Do the step again and remove what was built on it."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print the result as one JSON object on standard output."""
+
+
+def base_config(arguments: list[str]) -> RunConfig:
+    """The configuration that the options on the command line then change.
+
+    That is the run's own, or the preset's when one is named or the run is new. It has to be known before the
+    other options are parsed, so that their help shows the values that would really be used.
+    """
+    run, preset = Path(_option(arguments, "--run") or CommonArguments.run), _option(arguments, "--preset")
+    if preset in PRESETS:
+        return PRESETS[preset]
+    if (run / "config.json").is_file():
+        return configuration.load(run / "config.json")
+    return PRESETS["quick"]
+
+
+def config_of(options: CommonArguments) -> RunConfig:
+    """The configuration that parsed options refer to: see `base_config`."""
+    arguments = ["--run", str(options.run)]
+    if options.preset is not None:
+        arguments += ["--preset", options.preset]
+    return base_config(arguments)
+
+
+def _option(arguments: list[str], name: str) -> str | None:
+    for position, argument in enumerate(arguments):
+        if argument == name and position + 1 < len(arguments):
+            return arguments[position + 1]
+        if argument.startswith(name + "="):
+            return argument[len(name) + 1 :]
+    return None
+
+
+def common_config(options: CommonArguments, base: RunConfig) -> RunConfig:
+    """`base` with the variant and the seed of the options."""
+    return replace(
+        base,
+        variant=base.variant if options.variant is None else options.variant,
+        seed=base.seed if options.seed is None else options.seed,
+    )
+
+
+class Pipeline:
+    """One run folder, its configuration, and the steps."""
+
+    def __init__(self, folder: Path, config: RunConfig, jobs: int, progress: Progress | None = None) -> None:
+        if jobs < 1:
+            raise UserError(f"--jobs {jobs}: at least one process is needed")
+        self.run = RunFolder(folder)
+        self.config = config
+        self.jobs = jobs
+        self.progress = progress or ConsoleProgress()
+
+    def configure(self, redo_from: str | None = None) -> None:
+        """Write config.json, after checking that no finished step was made with other settings.
+
+        Raises:
+            UserError: a finished step was made with other settings and is not to be redone.
+        """
+        if self.run.path.exists() and not self.run.path.is_dir():
+            raise UserError(f"{self.run.path}: is a file; a run is a folder")
+        if redo_from is not None:
+            self._remove_from(redo_from)
+        if self.run.has("config"):
+            self._check_unchanged(configuration.load(self.run.config))
+        elif self.run.path.is_dir() and any(not item.name.startswith(".") for item in self.run.path.iterdir()):
+            raise UserError(f"{self.run.path}: holds files but no config.json, so it is no run folder; name another")
+        configuration.save(self.config, self.run.config, _versions())
+
+    def _check_unchanged(self, old: RunConfig) -> None:
+        shared = ("domain", "variant", "seed")
+        for step in ("collect", "train", "extract"):
+            if not self.run.has(step):
+                continue
+            changed = [
+                f"{name}: {getattr(old, name)}, now {getattr(self.config, name)}"
+                for name in shared
+                if getattr(old, name) != getattr(self.config, name)
+            ]
+            changed += configuration.differences(getattr(old, step), getattr(self.config, step), f"{step}.")
+            if changed:
+                raise UserError(
+                    f"{self.run.path}: '{step}' was made with other settings ({'; '.join(changed)}); "
+                    f"name another --run, or redo it with: nesy {step} --run {self.run.path} --redo"
+                )
+
+    def _remove_from(self, first: str) -> None:
+        steps = list(OUTPUTS)
+        for step in steps[steps.index(first) :]:
+            for name in OUTPUTS[step]:
+                path = self.run.path / name
+                if path.is_dir():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink(missing_ok=True)
+
+    def _timed(self, step: str, work: Callable[[], Any]) -> Any:
+        started = time.perf_counter()
+        value = work()
+        timing = self.run.read_summary().get("timing", {})
+        timing[step] = round(timing.get(step, 0.0) + time.perf_counter() - started, 3)
+        self.run.update_summary(timing=timing, provenance=self._provenance())
+        return value
+
+    def _provenance(self) -> dict[str, Any]:
+        return {
+            "preset": self.config.preset,
+            "domain": self.config.domain,
+            "variant": self.config.variant,
+            "seed": self.config.seed,
+            "versions": _versions(),
+            "machine": {
+                "processor": platform.machine(),
+                "cores": os.cpu_count(),
+                "system": platform.system(),
+            },
+        }
+
+    def collect(self) -> dict[str, Any]:
+        """Collect experience."""
+        from domains.core import load_domain
+        from nesy.collection import collect
+
+        if not self.run.has("collect"):
+            domain = load_domain(self.config.domain)
+            rows = self._timed(
+                "collect",
+                lambda: collect(
+                    domain,
+                    self.config.collect,
+                    self.run.experience,
+                    variant=self.config.variant,
+                    seed=self.config.seed,
+                    progress=self.progress,
+                ),
+            )
+            write_json(self.run.experience / "complete.json", {"rows": rows})
+            self.run.update_summary(experience={"rows": rows})
+        return dict(self.run.read_summary()["experience"])
+
+    def train(self) -> dict[str, Any]:
+        """Train the world model."""
+        self.run.require("collect")
+        if not self.run.has("train"):
+            from nesy.experience import Experience
+            from nesy.world_model import train
+
+            metrics = self._timed(
+                "train",
+                lambda: train(
+                    Experience.load(self.run.experience),
+                    self.config.train,
+                    self.run.world_model,
+                    seed=self.config.seed,
+                    progress=self.progress,
+                ),
+            )
+            self.run.update_summary(world_model=metrics)
+        return dict(self.run.read_summary()["world_model"])
+
+    def extract(self) -> dict[str, Any]:
+        """Extract the 2DBN."""
+        self.run.require("collect", "train")
+        if not self.run.has("extract"):
+            from nesy.dbn import extract_run
+
+            figures = self._timed("extract", lambda: extract_run(self.run, self.config.domain))
+            self.run.update_summary(dbn=figures)
+        return dict(self.run.read_summary()["dbn"])
+
+    def compare(self) -> dict[str, Any]:
+        """Compare the agents."""
+        self.run.require("collect", "train", "extract")
+        from planners.compare import compare
+
+        cells = self._timed(
+            "compare",
+            lambda: compare(
+                self.run,
+                self.config.compare,
+                domain_name=self.config.domain,
+                seed=self.config.seed,
+                jobs=self.jobs,
+                progress=self.progress,
+            ),
+        )
+        self.run.update_summary(comparison=cells)
+        write_json(self.run.results / "comparison.json", cells)
+        return {"comparison": cells}
+
+    def report(self) -> dict[str, Any]:
+        """Write report.html."""
+        from nesy.report import write_report
+
+        self.run.require("collect", "train", "extract", "compare")
+        path = self._timed("report", lambda: write_report(self.run, self.progress))
+        return {"report": str(path)}
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version(), "nesy": importlib.metadata.version("nesy")}
+    for library in LIBRARIES:
+        found[library] = importlib.metadata.version(library)
+    return found
+
+
+def say(message: str) -> None:
+    """Tell the user something that is not the result: on standard error."""
+    print(message, file=sys.stderr, flush=True)

@@ -1,0 +1,51 @@
+"""The main job: collect, train, extract, compare, report. Goes on where it stopped when called again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from nesy.cli import pipeline, tables
+from nesy.config import CollectConfig, ExtractConfig, TrainConfig
+from planners.config import CompareConfig
+
+
+@dataclass(frozen=True)
+class Arguments(pipeline.CommonArguments):
+    """Options of `nesy run`."""
+
+    collect: CollectConfig = CollectConfig()
+    train: TrainConfig = TrainConfig()
+    extract: ExtractConfig = ExtractConfig()
+    compare: CompareConfig = CompareConfig()
+
+
+def defaults(arguments: list[str]) -> Arguments:
+    """The options' values where the command line says nothing."""
+    base = pipeline.base_config(arguments)
+    return Arguments(collect=base.collect, train=base.train, extract=base.extract, compare=base.compare)
+
+
+def run(options: Arguments) -> dict[str, Any]:
+    """Run every step that the folder does not hold yet; returns the summary."""
+    config = replace(
+        pipeline.common_config(options, pipeline.config_of(options)),
+        collect=options.collect,
+        train=options.train,
+        extract=options.extract,
+        compare=options.compare,
+    )
+    work = pipeline.Pipeline(options.run, config, options.jobs)
+    with work.run.lock():
+        work.configure(redo_from="collect" if options.redo else None)
+        for step in (work.collect, work.train, work.extract, work.compare, work.report):
+            step()
+    return {**work.run.read_summary(), "report": str(work.run.report)}
+
+
+def show(result: dict[str, Any]) -> None:
+    """Print the comparison table and where the report is."""
+    tables.print_comparison(result["comparison"])
+    seconds = ", ".join(f"{step} {value:.0f} s" for step, value in result["timing"].items())
+    print(f"time: {seconds}")
+    print(f"report: {result['report']}")
