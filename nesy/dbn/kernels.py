@@ -1,4 +1,4 @@
-"""The 2DBN as flat arrays for compiled kernels, and the kernels that draw from it and push beliefs through it.
+"""The 2DBN as flat arrays for compiled kernels, and the kernels that draw from it.
 
 The planners' inner loops take `Packed` apart into its arrays (numba compiles them as plain arguments).
 """

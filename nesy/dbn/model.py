@@ -188,7 +188,7 @@ class TwoSliceDBN:
         return len(self.action_names)
 
     def parents(self, action: int, factor: int) -> tuple[tuple[int, int], ...]:
-        """The parents of a factor as (slice, factor) pairs, slice 0 or 1, in the order of the table's digits."""
+        """The parents of a factor as (slice 0 or 1, factor), in the order of the table's digits."""
         return tuple((0, p) for p in self.parents_now[action][factor]) + tuple(
             (1, p) for p in self.parents_next[action][factor]
         )
@@ -230,7 +230,7 @@ class TwoSliceDBN:
 
     # ---------------------------------------------------------------- inference
     def log_prob(self, code: np.ndarray, action: int | np.ndarray, next_code: np.ndarray) -> np.ndarray:
-        """log T(x' | x, a) in nats, for one transition or many.
+        """Log-probability T(x' | x, a) in nats, of one transition or many.
 
         Args:
             code: integers [..., N].
@@ -325,7 +325,13 @@ class TwoSliceDBN:
             "provenance": self.provenance,
         }
         arrays = {"probabilities": self.probabilities, "row_counts": self.row_counts, "initial": self.initial}
-        storage.save(Path(path), "model", "tables", document, arrays | {f"table_{k}": v for k, v in self.tables.items()})
+        storage.save(
+            Path(path),
+            "model",
+            "tables",
+            document,
+            arrays | {f"table_{k}": v for k, v in self.tables.items()},
+        )
 
     @classmethod
     def load(cls, path: Path | str) -> TwoSliceDBN:

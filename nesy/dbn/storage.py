@@ -1,4 +1,4 @@
-"""A JSON file and an .npz file that belong together, with checksums, for data that strangers may have written.
+"""A JSON file and an .npz file that belong together, with checksums, for data from strangers.
 
 The JSON file holds the SHA-256 of the .npz file and of itself, so that a changed, swapped or truncated
 byte in either is found. Arrays are stored uncompressed and without objects: reading runs no code, and
@@ -37,7 +37,10 @@ def save(folder: Path, name: str, tables: str, document: dict[str, Any], arrays:
             # a fixed date: the same model gives the same bytes
             archive.writestr(zipfile.ZipInfo(f"{key}.npy", date_time=(1980, 1, 1, 0, 0, 0)), member.getbuffer())
     content = buffer.getbuffer()
-    complete = {**document, "tables": {"file": tables_path.name, "sha256": hashlib.sha256(content).hexdigest()}}
+    complete = {
+        **document,
+        "tables": {"file": tables_path.name, "sha256": hashlib.sha256(content).hexdigest()},
+    }
     with atomic_path(tables_path) as temporary:
         temporary.write_bytes(content)
     with atomic_path(folder / f"{name}.json") as temporary:
@@ -120,6 +123,13 @@ def _read_arrays(path: Path, content: bytes) -> dict[str, np.ndarray]:
             if dtype.hasobject or fortran or length * dtype.itemsize != member.file_size - stream.tell():
                 raise ValueError(f"array {member.filename!r} does not fit its header")
             arrays[member.filename[:-4]] = np.frombuffer(content, dtype, length, first).reshape(shape)
-    except (ValueError, struct.error, zipfile.BadZipFile, KeyError, NotImplementedError, OverflowError) as error:
+    except (
+        ValueError,
+        struct.error,
+        zipfile.BadZipFile,
+        KeyError,
+        NotImplementedError,
+        OverflowError,
+    ) as error:
         raise UserError(f"{path}: not a readable table file ({error})") from None
     return arrays

@@ -1,0 +1,57 @@
+"""The 2DBN as a networkx graph, and how strong its arcs are."""
+
+from __future__ import annotations
+
+import networkx
+import numpy as np
+
+from nesy.dbn.model import TwoSliceDBN
+
+
+def to_networkx(dbn: TwoSliceDBN, action: int | None = None) -> networkx.MultiDiGraph:
+    """The graph of one action, or of all.
+
+    Nodes are `X0` (slice t, attributes `factor`, `slice` 0) and `X0'` (slice t+1). Edges have the key and
+    attribute `action`, and `strength` in [0, 1] (see `arc_strength`).
+    """
+    graph = networkx.MultiDiGraph()
+    for where, mark in ((0, ""), (1, "'")):
+        for i, name in enumerate(dbn.factor_names):
+            graph.add_node(f"{name}{mark}", factor=i, slice=where)
+    for a in range(dbn.num_actions) if action is None else (action,):
+        for i, name in enumerate(dbn.factor_names):
+            strengths = arc_strength(dbn, a, i)
+            for (where, p), strength in zip(dbn.parents(a, i), strengths, strict=True):
+                source = dbn.factor_names[p] + ("'" if where else "")
+                graph.add_edge(
+                    source, f"{name}'", key=dbn.action_names[a], action=dbn.action_names[a], strength=strength
+                )
+    return graph
+
+
+def arc_strength(dbn: TwoSliceDBN, action: int, factor: int) -> list[float]:
+    """How far each parent's value can change the factor's distribution.
+
+    Largest total variation between two rows that differ in that parent alone, over the rows met in
+    experience where both were, else over all rows.
+
+    Returns:
+        One number in [0, 1] per parent, in the order of `TwoSliceDBN.parents`.
+    """
+    k = dbn.num_values
+    table, visited = dbn.tensor(action, factor), dbn.counts(action, factor) > 0
+    known = bool(visited.any())
+    visited = visited.reshape(table.shape[:-1])
+    result = []
+    for axis in range(table.ndim - 1):
+        rows = np.moveaxis(table, axis, 0).reshape(k, -1, k)
+        seen = np.moveaxis(visited, axis, 0).reshape(k, -1)
+        strongest = 0.0
+        for left in range(k):
+            for right in range(left + 1, k):
+                pairs = seen[left] & seen[right] if known else np.ones(rows.shape[1], dtype=bool)
+                if pairs.any():
+                    distance = 0.5 * np.abs(rows[left, pairs] - rows[right, pairs]).sum(axis=1).max()
+                    strongest = max(strongest, float(distance))
+        result.append(min(strongest, 1.0))
+    return result
