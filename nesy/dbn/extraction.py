@@ -1,0 +1,167 @@
+"""Extraction of the 2DBN: from a network whose conditionals are tables already, by exact enumeration.
+
+The `symbolic` architecture decides every next factor from few parents, so that each of its conditionals
+can be enumerated over all parent values: the table is the network, nothing is fitted. Counts of the
+transitions met in experience stand behind every row; a row with count 0 is the network's guess.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from nesy.dbn.codebook import Codebook, distinct_views, value_meanings
+from nesy.dbn.model import TwoSliceDBN
+from nesy.errors import UserError
+
+if TYPE_CHECKING:
+    from nesy.run_folder import RunFolder
+
+Structure = Sequence[Sequence[tuple[Sequence[int], Sequence[int]]]]
+
+
+class Conditionals(Protocol):
+    """A network that decides each next factor from few parents."""
+
+    def structure(self) -> Structure:
+        """[a][i]: the parents of factor i under action a, in slice t and in slice t+1."""
+        ...
+
+    def conditional(self, action: int, factor: int) -> np.ndarray:
+        """One conditional, float64 [rows, K]: parents of slice t first, first parent most significant."""
+        ...
+
+
+def extract(
+    model: Conditionals,
+    codes: np.ndarray,
+    actions: np.ndarray,
+    next_codes: np.ndarray,
+    *,
+    action_names: Sequence[str] | None = None,
+    initial_codes: np.ndarray | None = None,
+    meanings: Sequence[Sequence[str]] = (),
+    provenance: dict[str, Any] | None = None,
+) -> TwoSliceDBN:
+    """Enumerate the conditionals of `model`, and count behind every row the transitions met.
+
+    Args:
+        model: the network.
+        codes: uint8 [n, N], slice t of the transitions met in experience.
+        actions: integers [n].
+        next_codes: uint8 [n, N].
+        action_names: A names.
+        initial_codes: uint8 [m, N], codes at the start of episodes; the initial distribution is theirs.
+        meanings: [N][K] texts.
+        provenance: where the model comes from, JSON values.
+
+    Raises:
+        UserError: the network's structure is none of a 2DBN.
+    """
+    structure = model.structure()
+    cpts = [
+        [np.asarray(model.conditional(a, i), dtype=np.float64) for i in range(len(per_action))]
+        for a, per_action in enumerate(structure)
+    ]
+    dbn = TwoSliceDBN.from_tables(
+        cpts,
+        [[now for now, _ in per_action] for per_action in structure],
+        [[later for _, later in per_action] for per_action in structure],
+        action_names=action_names,
+        initial=None if initial_codes is None else marginals(initial_codes, cpts[0][0].shape[-1]),
+        value_meanings=meanings,
+        provenance=provenance,
+    )
+    return with_counts(dbn, codes, actions, next_codes)
+
+
+def with_counts(dbn: TwoSliceDBN, codes: np.ndarray, actions: np.ndarray, next_codes: np.ndarray) -> TwoSliceDBN:
+    """The same model with the number of the given transitions behind every row."""
+    from dataclasses import replace
+
+    counts = np.zeros(len(dbn.probabilities), dtype=np.int64)
+    for a in range(dbn.num_actions):
+        chosen = np.asarray(actions) == a
+        now, later = codes[chosen].astype(np.int64), next_codes[chosen].astype(np.int64)
+        for i in range(dbn.num_factors):
+            start = dbn.offsets[a, i]
+            rows = dbn.num_rows(a, i)
+            counts[start : start + rows] = np.bincount(dbn.rows(a, i, now, later), minlength=rows)
+    return replace(dbn, row_counts=counts)
+
+
+def marginals(codes: np.ndarray, num_values: int) -> np.ndarray:
+    """The marginal distribution of every factor over some codes: float64 [N, K]."""
+    if not len(codes):
+        raise UserError("no codes to take an initial distribution from")
+    return np.stack([np.bincount(column, minlength=num_values) / len(codes) for column in codes.T])
+
+
+def extract_run(run: RunFolder, domain_name: str) -> dict[str, Any]:
+    """Extract the 2DBN of a run: writes dbn/ (model and codebook) and returns its figures for summary.json.
+
+    Raises:
+        UserError: the run lacks its experience or its world model, or they are damaged.
+    """
+    from domains.core import load_domain
+    from nesy.dbn.measures import fidelity
+    from nesy.experience import Experience
+    from nesy.world_model import SymbolicCodec, load_world_model
+
+    domain = load_domain(domain_name)
+    experience = Experience.load(run.experience)
+    if not len(experience):
+        raise UserError(f"{run.experience}: holds no transitions")
+    model = load_world_model(run.world_model)
+    transitions = encode(experience, SymbolicCodec(model))
+    codebook = Codebook.build(transitions.views, transitions.view_codes, transitions.view_counts, domain.predicates)
+    dbn = extract(
+        model,
+        transitions.codes,
+        transitions.actions,
+        transitions.next_codes,
+        action_names=domain.spec.action_names,
+        initial_codes=transitions.codes[experience.t == 0] if (experience.t == 0).any() else None,
+        meanings=value_meanings(codebook, int(model.num_values)),
+        provenance={
+            "source": "network",
+            "domain": domain_name,
+            "architecture": str(model.architecture),
+            "world_model_sha256": _digest(run.world_model / "model.safetensors"),
+            "transitions": len(experience),
+        },
+    )
+    codebook.save(run.dbn)
+    # last: the step counts as done when model.json is there
+    dbn.save(run.dbn)
+    return fidelity(TwoSliceDBN.load(run.dbn), model, transitions)
+
+
+class Transitions:
+    """Experience in codes.
+
+    Attributes: `codes`, `next_codes` uint8 [n, N]; `actions` int64 [n]; `views` uint8 [V, v, v] distinct
+    views met, `view_codes` uint8 [V, N], `view_counts` int64 [V]; `view_index`, `next_view_index` int64 [n].
+    """
+
+    def __init__(self, views: np.ndarray, actions: np.ndarray, next_views: np.ndarray, encode_views: Any) -> None:
+        both = np.concatenate([views, next_views])
+        self.views, index, self.view_counts = distinct_views(both)
+        self.view_codes = np.asarray(encode_views(self.views), dtype=np.uint8)
+        self.view_index, self.next_view_index = index[: len(views)], index[len(views) :]
+        self.codes = self.view_codes[self.view_index]
+        self.next_codes = self.view_codes[self.next_view_index]
+        self.actions = np.asarray(actions, dtype=np.int64)
+
+
+def encode(experience: Any, codec: Any) -> Transitions:
+    """Every transition of `experience` in the codes of `codec`."""
+    return Transitions(experience.view, experience.action, experience.next_view, codec.codes)
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
