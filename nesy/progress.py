@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
-from typing import Protocol
+from typing import Any, Protocol
 
 
 class Task(Protocol):
@@ -96,7 +96,7 @@ def _bar(description: str, total: int) -> Iterator[Task]:
                 """Move the bar."""
                 self.done += steps
                 rate = self.done / max(time.monotonic() - started, 1e-9)
-                fields = {"rate": _rate(rate)}
+                fields: dict[str, Any] = {"rate": _rate(rate)}
                 if metrics:
                     fields["metrics"] = _metrics(metrics)
                 bars.update(task_id, advance=steps, **fields)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import tyro
 
 from nesy.cli import pipeline, tables
-from nesy.cli.configuration import RunConfig
 from nesy.config import CollectConfig
 
 
@@ -26,11 +25,8 @@ def defaults(arguments: list[str]) -> Arguments:
 
 def run(options: Arguments) -> dict[str, Any]:
     """Collect into the run folder."""
-    base: RunConfig = pipeline.common_config(options, pipeline.config_of(options))
-    work = pipeline.Pipeline(options.run, replace(base, collect=options.settings), options.jobs)
-    with work.run.lock():
-        work.configure(redo_from="collect" if options.redo else None)
-        return work.collect()
+    with pipeline.opened(options, "collect", collect=options.settings) as steps:
+        return steps.collect()
 
 
 def show(result: dict[str, Any]) -> None:

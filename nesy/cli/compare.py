@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import tyro
@@ -25,11 +25,8 @@ def defaults(arguments: list[str]) -> Arguments:
 
 def run(options: Arguments) -> dict[str, Any]:
     """Run the cells of the grid that the run folder does not hold yet."""
-    base = pipeline.common_config(options, pipeline.config_of(options))
-    work = pipeline.Pipeline(options.run, replace(base, compare=options.settings), options.jobs)
-    with work.run.lock():
-        work.configure(redo_from="compare" if options.redo else None)
-        return work.compare()
+    with pipeline.opened(options, "compare", compare=options.settings) as steps:
+        return steps.compare()
 
 
 def show(result: dict[str, Any]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,6 +11,7 @@ import tyro
 from nesy.cli import pipeline, tables
 from nesy.config import ExtractConfig
 from nesy.errors import UserError
+from nesy.run_folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -37,31 +38,28 @@ def defaults(arguments: list[str]) -> Arguments:
 
 def run(options: Arguments) -> dict[str, Any]:
     """Extract inside the run folder, then print and export as asked."""
-    base = pipeline.common_config(options, pipeline.config_of(options))
-    work = pipeline.Pipeline(options.run, replace(base, extract=options.settings), options.jobs)
-    with work.run.lock():
-        work.configure(redo_from="extract" if options.redo else None)
-        result = work.extract()
+    with pipeline.opened(options, "extract", extract=options.settings) as steps:
+        result = steps.extract()
     if options.to is not None:
-        result["exported"] = str(_export(work, options))
+        result["exported"] = str(_export(RunFolder(options.run), options))
     if options.table or options.factor is not None or options.action is not None:
-        result["table"] = _table(work, options)
+        result["table"] = _table(RunFolder(options.run), options)
     return result
 
 
-def _export(work: pipeline.Pipeline, options: Arguments) -> Path:
+def _export(run: RunFolder, options: Arguments) -> Path:
     from nesy import formats
     from nesy.dbn import TwoSliceDBN
 
     assert options.to is not None
-    formats.export(TwoSliceDBN.load(work.run.dbn), options.to, format=options.format)
+    formats.export(TwoSliceDBN.load(run.dbn), options.to, format=options.format)
     return options.to
 
 
-def _table(work: pipeline.Pipeline, options: Arguments) -> str:
+def _table(run: RunFolder, options: Arguments) -> str:
     from nesy.dbn import TwoSliceDBN, describe
 
-    dbn = TwoSliceDBN.load(work.run.dbn)
+    dbn = TwoSliceDBN.load(run.dbn)
     if options.action is not None and options.action not in dbn.action_names:
         raise UserError(f"--action {options.action}: no such action; the actions are {', '.join(dbn.action_names)}")
     if options.factor is not None and not 0 <= options.factor < len(dbn.factor_names):

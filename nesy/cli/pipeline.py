@@ -12,7 +12,8 @@ import platform
 import shutil
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -87,13 +88,31 @@ def _option(arguments: list[str], name: str) -> str | None:
     return None
 
 
-def common_config(options: CommonArguments, base: RunConfig) -> RunConfig:
-    """`base` with the variant and the seed of the options."""
-    return replace(
+@contextmanager
+def opened(options: CommonArguments, step: str, **sections: Any) -> Iterator[Pipeline]:
+    """The pipeline of the run that the options name, locked for writing and configured.
+
+    Args:
+        options: the parsed options of the command.
+        step: the first step that the command does; only the first of all may make a new run folder.
+        sections: the configuration's sections that the command's options set.
+
+    Raises:
+        UserError: the folder is missing, locked, or holds steps made with other settings.
+    """
+    if step != next(iter(OUTPUTS)):
+        RunFolder.open(options.run)
+    base = config_of(options)
+    config = replace(
         base,
         variant=base.variant if options.variant is None else options.variant,
         seed=base.seed if options.seed is None else options.seed,
+        **sections,
     )
+    pipeline = Pipeline(options.run, config, options.jobs)
+    with pipeline.run.lock():
+        pipeline.configure(redo_from=step if options.redo else None)
+        yield pipeline
 
 
 class Pipeline:
@@ -246,7 +265,7 @@ class Pipeline:
 
     def report(self) -> dict[str, Any]:
         """Write report.html."""
-        from nesy.report import write_report
+        from nesy.report.page import write_report
 
         self.run.require("collect", "train", "extract", "compare")
         path = self._timed("report", lambda: write_report(self.run, self.progress))

@@ -56,10 +56,10 @@ def run(options: Arguments) -> dict[str, Any]:
             "ask one question: --means F=V, --changes ACTION, --predicate NAME, --vocabulary or --program FILE"
             + (f" (found {', '.join('--' + name for name in asked)})" if asked else "")
         )
-    from nesy.asp import KnowledgeBase
-
     run_folder = RunFolder.open(options.run)
     run_folder.require("extract")
+    from nesy.asp import KnowledgeBase
+
     knowledge = KnowledgeBase.from_run(run_folder.path)
     if options.means is not None:
         factor, value = _factor_and_value(options.means)

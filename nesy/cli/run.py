@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from nesy.cli import pipeline, tables
@@ -28,19 +28,11 @@ def defaults(arguments: list[str]) -> Arguments:
 
 def run(options: Arguments) -> dict[str, Any]:
     """Run every step that the folder does not hold yet; returns the summary."""
-    config = replace(
-        pipeline.common_config(options, pipeline.config_of(options)),
-        collect=options.collect,
-        train=options.train,
-        extract=options.extract,
-        compare=options.compare,
-    )
-    work = pipeline.Pipeline(options.run, config, options.jobs)
-    with work.run.lock():
-        work.configure(redo_from="collect" if options.redo else None)
-        for step in (work.collect, work.train, work.extract, work.compare, work.report):
+    sections = {step: getattr(options, step) for step in ("collect", "train", "extract", "compare")}
+    with pipeline.opened(options, "collect", **sections) as steps:
+        for step in (steps.collect, steps.train, steps.extract, steps.compare, steps.report):
             step()
-    return {**work.run.read_summary(), "report": str(work.run.report)}
+        return {**steps.run.read_summary(), "report": str(steps.run.report)}
 
 
 def show(result: dict[str, Any]) -> None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import tyro
 
 from nesy.cli import pipeline, tables
-from nesy.cli.configuration import RunConfig
 from nesy.config import TrainConfig
 
 
@@ -26,11 +25,8 @@ def defaults(arguments: list[str]) -> Arguments:
 
 def run(options: Arguments) -> dict[str, Any]:
     """Train inside the run folder."""
-    base: RunConfig = pipeline.common_config(options, pipeline.config_of(options))
-    work = pipeline.Pipeline(options.run, replace(base, train=options.settings), options.jobs)
-    with work.run.lock():
-        work.configure(redo_from="train" if options.redo else None)
-        return work.train()
+    with pipeline.opened(options, "train", train=options.settings) as steps:
+        return steps.train()
 
 
 def show(result: dict[str, Any]) -> None:

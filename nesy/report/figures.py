@@ -1,0 +1,138 @@
+"""Figures of the report, each a function from plain data to SVG text.
+
+Colours are Okabe and Ito's, which stay apart for colour-blind readers.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib
+import numpy as np
+
+matplotlib.use("Agg")
+
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+# empty, wall, goal, unseen
+CELL_COLOURS = ListedColormap(["#f4f1ea", "#4d4d4d", "#009E73", "#b9c6d6"])
+
+
+@dataclass(frozen=True)
+class BeliefExample:
+    """One moment: what the robot sees, what it believes, and what it takes the person to believe.
+
+    Attributes:
+        view: uint8 [5, 5], the robot's view, indexed [vx, vy].
+        person: (vx, vy, heading) of the person in that view.
+        belief: float [N, K], the robot's belief b.
+        shifted: float [N, K], the shifted belief b~.
+        decoded: uint8 [5, 5], what b decodes to.
+        decoded_shifted: uint8 [5, 5], what b~ decodes to.
+        person_view: uint8 [5, 5], what the person really sees.
+        actions: names of the imagined actions.
+    """
+
+    view: np.ndarray
+    person: tuple[int, int, int]
+    belief: np.ndarray
+    shifted: np.ndarray
+    decoded: np.ndarray
+    decoded_shifted: np.ndarray
+    person_view: np.ndarray
+    actions: tuple[str, ...]
+
+
+def _svg(figure: Figure) -> str:
+    """The figure as an inline <svg> element, with no date in it so that the same data give the same text."""
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", bbox_inches="tight", metadata={"Date": None})
+    plt.close(figure)
+    text = buffer.getvalue()
+    return text[text.index("<svg") :]
+
+
+def comparison(cells: Sequence[dict[str, Any]]) -> str:
+    """Mean return of every cell with its interval, and the exact optimum as a line."""
+    figure, axes = plt.subplots(figsize=(8, 0.42 * len(cells) + 1.0))
+    labels = [" / ".join(filter(None, (c["agent"], c.get("inputs"), c.get("influence")))) for c in cells]
+    agents = list(dict.fromkeys(cell["agent"] for cell in cells))
+    for row, cell in enumerate(cells):
+        figures, colour = cell["return"], PALETTE[agents.index(cell["agent"]) % len(PALETTE)]
+        if figures.get("low") is not None:
+            axes.plot([figures["low"], figures["high"]], [row, row], color=colour, linewidth=2)
+        axes.plot(figures["mean"], row, "o", color=colour)
+        if cell["agent"] == "optimum":
+            axes.axvline(figures["mean"], color="#000000", linestyle=":", linewidth=1)
+    axes.set_yticks(range(len(cells)), labels)
+    axes.invert_yaxis()
+    axes.set_xlabel("return per episode (mean, 95 % interval; dotted: exact optimum)")
+    axes.grid(axis="x", alpha=0.3)
+    return _svg(figure)
+
+
+def learning_curves(curves: dict[str, np.ndarray], optimum: float | None, window: int) -> str:
+    """Running mean of the training return over `window` episodes, one line per name."""
+    figure, axes = plt.subplots(figsize=(8, 4))
+    for position, (name, returns) in enumerate(curves.items()):
+        width = min(window, len(returns))
+        total = np.cumsum(np.concatenate([[0.0], returns]))
+        mean = (total[width:] - total[:-width]) / width
+        episodes = np.arange(width, len(returns) + 1)
+        axes.plot(episodes, mean, color=PALETTE[position % len(PALETTE)], label=f"{name} ({len(returns)} episodes)")
+    if optimum is not None:
+        axes.axhline(optimum, color="#000000", linestyle=":", linewidth=1, label="exact optimum")
+    axes.set_xlabel("training episode")
+    axes.set_ylabel(f"return, mean of the last {window}")
+    axes.grid(alpha=0.3)
+    axes.legend(loc="best", fontsize=9)
+    return _svg(figure)
+
+
+def belief_panel(example: BeliefExample) -> str:
+    """The robot's view and belief beside the shifted belief and the person's true view."""
+    figure, axes = plt.subplots(2, 3, figsize=(10, 6.2))
+    _view(axes[0, 0], example.view, "robot's view (triangle: the person)")
+    _triangle(axes[0, 0], example.person)
+    _belief(axes[0, 1], example.belief, "robot's belief b")
+    _view(axes[0, 2], example.decoded, "b decoded")
+    _view(axes[1, 0], example.person_view, "person's true view")
+    _belief(axes[1, 1], example.shifted, "perspective-shifted belief b~")
+    _view(axes[1, 2], example.decoded_shifted, "b~ decoded")
+    figure.suptitle("imagined actions: " + (", ".join(example.actions) or "none"), fontsize=10)
+    figure.tight_layout()
+    return _svg(figure)
+
+
+def _view(axes: Axes, view: np.ndarray, title: str) -> None:
+    axes.imshow(view.T, cmap=CELL_COLOURS, vmin=0, vmax=3)
+    size = view.shape[0]
+    axes.set_xticks(np.arange(-0.5, size), [])
+    axes.set_yticks(np.arange(-0.5, size), [])
+    axes.tick_params(length=0)
+    axes.grid(color="#999999", linewidth=0.5)
+    _triangle(axes, (size // 2, size - 1, 3), colour="#D55E00")
+    axes.set_title(title, fontsize=10)
+
+
+def _triangle(axes: Axes, pose: tuple[int, int, int], colour: str = "#0072B2") -> None:
+    """A triangle at (vx, vy) that points along the heading (0 right, 1 down, 2 left, 3 up)."""
+    markers = (">", "v", "<", "^")
+    axes.plot(pose[0], pose[1], markers[pose[2] % 4], color=colour, markersize=11)
+
+
+def _belief(axes: Axes, belief: np.ndarray, title: str) -> None:
+    image = axes.imshow(belief, cmap="viridis", vmin=0, vmax=1, aspect="auto")
+    axes.set_xlabel("value")
+    axes.set_ylabel("factor")
+    axes.set_xticks(range(belief.shape[1]))
+    axes.set_yticks(range(belief.shape[0]))
+    axes.set_title(title, fontsize=10)
+    axes.figure.colorbar(image, ax=axes, fraction=0.046)

@@ -1,0 +1,62 @@
+"""The figures of summary.json as text: the same rows for the terminal and for the page."""
+
+from __future__ import annotations
+
+from typing import Any
+
+COMPARISON_COLUMNS = (
+    "agent",
+    "inputs",
+    "influence",
+    "variant",
+    "mean return",
+    "success",
+    "of optimum",
+    "ms/decision",
+    "episodes",
+)
+
+
+def comparison_rows(cells: list[dict[str, Any]]) -> list[tuple[str, ...]]:
+    """One row of text per cell of the comparison, in the order of `COMPARISON_COLUMNS`."""
+    rows = []
+    for cell in cells:
+        share = cell.get("share_of_optimum")
+        rows.append(
+            (
+                cell["agent"],
+                cell.get("inputs") or "",
+                cell.get("influence") or "",
+                cell["variant"],
+                interval(cell["return"], 1),
+                interval(cell["success"], 3),
+                "" if share is None else f"{100 * share:.1f} %",
+                f"{cell['ms_per_decision']:.3g}",
+                str(cell["episodes"]),
+            )
+        )
+    return rows
+
+
+def interval(figure: dict[str, float], digits: int) -> str:
+    """`mean [low, high]`, or the mean alone where it is exact."""
+    mean, low, high = figure["mean"], figure.get("low"), figure.get("high")
+    if low is None or high is None:
+        return f"{mean:.{digits}f} (exact)"
+    return f"{mean:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+
+
+def flat(figures: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    """Nested figures as (dotted name, value); lists are left out."""
+    rows: list[tuple[str, Any]] = []
+    for name, value in figures.items():
+        if isinstance(value, dict):
+            rows += flat(value, f"{prefix}{name}.")
+        elif not isinstance(value, list):
+            rows.append((prefix + name, value))
+    return rows
+
+
+def number(value: Any) -> str:
+    """Six significant digits for floats; anything else as it is."""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,127 @@
+"""The command line: help, one clear line for every mistake, configurations."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from nesy.cli import configuration
+from nesy.cli.main import COMMANDS, main
+from nesy.errors import UserError
+
+
+def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    printed = capsys.readouterr().out
+    for name in COMMANDS:
+        assert f"  {name} " in printed
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command, "--help"]) == 0
+    assert "--run" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["trian"], "did you mean 'train'"),
+        (["train", "--epoch", "3"], "--epoch"),
+        (["run", "--preset", "fast"], "fast"),
+        (["train", "--seed", "x"], "--seed"),
+        (["collect", "--jobs", "0"], "at least one process"),
+        (["query"], "ask one question"),
+        (["query", "--means", "3=5", "--changes", "left"], "ask one question"),
+    ],
+)
+def test_wrong_command_line(
+    arguments: list[str],
+    expected: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert expected in printed.err
+    assert len(printed.err.strip().splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", ["train", "extract", "compare", "report", "query --vocabulary"])
+def test_missing_run_folder(command: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main([*command.split(), "--run", str(tmp_path / "none")]) == 2
+    error = capsys.readouterr().err
+    assert "no such run folder" in error
+    assert len(error.strip().splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("command", "missing"),
+    [
+        ("train", "collect"),
+        ("extract", "collect"),
+        ("compare", "collect"),
+        ("report", "collect"),
+        ("query --vocabulary", "extract"),
+    ],
+)
+def test_run_folder_that_lacks_a_step(
+    command: str, missing: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    configuration.save(configuration.PRESETS["smoke"], tmp_path / "config.json", {})
+    assert main([*command.split(), "--run", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert f"lacks the step '{missing}'" in error
+    assert len(error.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("preset", sorted(configuration.PRESETS))
+def test_configuration_round_trip(preset: str, tmp_path: Path) -> None:
+    path = tmp_path / "config.json"
+    configuration.save(configuration.PRESETS[preset], path, {"python": "3"})
+    assert configuration.load(path) == configuration.PRESETS[preset]
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"format": 99}, "format"),
+        ({"sed": 1}, "unknown setting 'sed'"),
+        ({"seed": "one"}, "seed: expected int"),
+        ({"seed": True}, "seed: expected int"),
+        ({"preset": "huge"}, "is not one of"),
+        ({"train": {"epochs": 1.5}}, "epochs: expected int"),
+        ({"train": []}, "expected an object"),
+        ({"compare": {"agents": "dqn"}}, "expected a list"),
+    ],
+)
+def test_damaged_configuration(change: dict[str, object], expected: str, tmp_path: Path) -> None:
+    path = tmp_path / "config.json"
+    configuration.save(configuration.PRESETS["smoke"], path, {})
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    with pytest.raises(UserError, match=expected):
+        configuration.load(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[1]", b"[" * 100_000])
+def test_configuration_that_is_not_json(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "config.json"
+    path.write_bytes(content)
+    with pytest.raises(UserError, match=r"config\.json"):
+        configuration.load(path)
+
+
+def test_numbers_may_be_written_as_integers(tmp_path: Path) -> None:
+    path = tmp_path / "config.json"
+    configuration.save(configuration.PRESETS["smoke"], path, {})
+    settings = json.loads(path.read_text())
+    settings["train"]["kl_weight"] = 1
+    path.write_text(json.dumps(settings))
+    assert configuration.load(path).train.kl_weight == 1.0
