@@ -124,7 +124,7 @@ class SearchConfig:
 class CompareConfig:
     """What is compared: the grid of agents x input sets x influence modes x variants x seeds."""
 
-    agents: tuple[str, ...] = ("dqn", "pomdp", "search", "greedy-follower", "greedy-last-seen", "random", "optimum")
+    agents: tuple[str, ...] = AGENTS
     """Which agents: dqn, pomdp (pomdp-py), search, greedy-follower, greedy-last-seen, random, optimum."""
     inputs: tuple[str, ...] = ("full",)
     """Input sets of the DQN: paper (b, b~) or full (b, b~ and the configuration)."""
@@ -135,7 +135,7 @@ class CompareConfig:
     seeds: tuple[int, ...] = (0,)
     """Seeds; every cell is run once per seed."""
     episodes: int = 168
-    """Evaluation episodes per seed (the same maps and seeds for all; on `paper` a multiple of its 42 maps)."""
+    """Evaluation episodes per seed, the same maps and seeds for all (`paper`: a multiple of its 42 maps)."""
     planner_episodes: int = 42
     """Evaluation episodes per seed for the agents that search (`pomdp` and `search`)."""
     confidence: float = 0.95
