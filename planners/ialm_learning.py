@@ -1,0 +1,173 @@
+"""Learning the tables of the influence-augmented local model (planners.ialm) from logged transitions."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from nesy.dbn.model import TwoSliceDBN
+from nesy.errors import UserError
+from planners import ialm
+from planners.ialm import FORWARD, IALM, SCALARS, STAY, TIMEOUT, WAIT, Codec
+from planners.motion import RelativeMotion, learn_motion
+from planners.tables import DecisionTable, Parents, learn_distribution, learn_mean
+
+if TYPE_CHECKING:
+    from nesy.experience import Experience
+
+_ORDERED = {"side", "ahead", "waiting", "lost"}
+
+
+def learn_ialm(
+    dbn: TwoSliceDBN, codec: Codec, experience: Experience, provenance: dict[str, Any] | None = None
+) -> IALM:
+    """Learn every table from experience.
+
+    Args:
+        dbn: the 2DBN extracted from the same codes.
+        codec: turns views into codes.
+        experience: transitions of person following (all tables), and of the crossing task's expert (pi only).
+        provenance: recorded with the model.
+    """
+    following = experience.select(np.char.startswith(experience.source, "following"))
+    if len(following) == 0:
+        raise UserError("the experience holds no person-following episodes; collect some (sources following-*)")
+    motion, moved = learn_motion(following)
+    variables = _variables(dbn.num_factors, codec, following, motion, moved)
+    names = _slot_names(dbn.num_factors)
+    n = dbn.num_factors
+
+    def parents(*wanted: str) -> Parents:
+        slots: list[int] = []
+        for name in wanted:
+            if name in ("x", "next_x", "y"):
+                start = ("x", "next_x", "y").index(name) * n
+                slots += range(start, start + n)
+            elif name in ("c", "mid", "next"):
+                prefix = {"c": "", "mid": "mid_", "next": "next_"}[name]
+                slots += [3 * n + SCALARS.index(prefix + part) for part in ("side", "ahead", "heading")]
+            else:
+                slots.append(3 * n + SCALARS.index(name))
+        plain = [names[s].removeprefix("mid_").removeprefix("next_") for s in slots]
+        return Parents(tuple(names[s] for s in slots), tuple(slots), tuple(p in _ORDERED for p in plain))
+
+    def column(scalar: int) -> np.ndarray:
+        return variables[:, 3 * n + scalar]
+
+    forward = column(ialm.ACTION) == FORWARD
+    waited = column(ialm.PERSON) == WAIT
+    followed, next_waiting, next_lost = _next_counters(following)
+    outcome = column(ialm.THE_OUTCOME).astype(np.int64)
+    variables[followed, 3 * n + ialm.NEXT_LOST_COUNT] = next_lost[followed]
+    # Where the episode ended there is no next counter to read; the table learned from the others fills it in.
+    lost_table = learn_distribution(
+        variables[followed], parents("lost", "next", "next_x"), next_lost[followed], int(next_lost.max()) + 2
+    )
+    ended = ~followed
+    estimated = lost_table.estimates()[lost_table.locate(variables[ended])].argmax(axis=1)
+    variables[ended, 3 * n + ialm.NEXT_LOST_COUNT] = estimated
+    tables = {
+        "moved": learn_distribution(variables[forward], parents("x", "c"), moved[forward].astype(np.int64), 2),
+        "waits": learn_distribution(variables, parents("mid", "next_x", "waiting"), waited.astype(np.int64), 2),
+        "influence": _learn_influence(dbn, codec, experience, parents("y")),
+        "next_waiting": learn_distribution(
+            variables[followed], parents("waiting", "person"), next_waiting[followed], int(next_waiting.max()) + 1
+        ),
+        "next_lost": lost_table,
+        "visible": learn_distribution(
+            variables, parents("next", "next_x"), (following.next_configuration > 0).astype(np.int64), 2
+        ),
+        "outcome": learn_distribution(
+            variables,
+            parents("action", "motion", "person", "c", "next", "visible", "next_lost", "lost", "x", "y"),
+            outcome,
+            int(outcome.max()) + 1,
+        ),
+        "reward": learn_mean(
+            variables,
+            parents("action", "motion", "next", "visible", "next_lost", "outcome", "next_x"),
+            following.reward,
+        ),
+    }
+    first = following.t == following.t.min()
+    poses, counts = np.unique(following.relative_pose[first], axis=0, return_counts=True)
+    return IALM(
+        dbn=dbn,
+        motion=motion,
+        tables=tables,
+        initial_poses=poses.astype(np.int16),
+        initial_pose_counts=counts.astype(np.int64),
+        initial_waiting=np.bincount(following.waiting[first].clip(0)).astype(np.int64),
+        view_size=int(following.view.shape[-1]),
+        provenance=dict(provenance or {}),
+    )
+
+
+def _slot_names(num_factors: int) -> list[str]:
+    codes = [f"{prefix}{i}" for prefix in ("x", "next_x", "y") for i in range(num_factors)]
+    return codes + list(SCALARS)
+
+
+def _variables(
+    num_factors: int, codec: Codec, experience: Experience, motion: RelativeMotion, moved: np.ndarray
+) -> np.ndarray:
+    """All variables of every step: int32 [n, 3N + len(SCALARS)]; `next_lost` is left 0."""
+    n = num_factors
+    out = np.zeros((len(experience), 3 * n + len(SCALARS)), np.int32)
+    out[:, :n] = codec.codes(experience.view)
+    out[:, n : 2 * n] = codec.codes(experience.next_view)
+    out[:, 2 * n : 3 * n] = codec.codes(experience.person_view)
+    action = experience.action.astype(np.int64)
+    effective = np.where((action == FORWARD) & ~moved, STAY, action)
+    middle = motion.apply(experience.relative_pose, effective, np.full(len(action), WAIT))
+    outcome = np.where(experience.outcome == TIMEOUT, 0, experience.outcome)
+    columns: dict[int, np.ndarray] = {
+        ialm.ACTION: action,
+        ialm.MOTION: effective,
+        ialm.PERSON: experience.person_action,
+        ialm.IS_WAITING: experience.waiting,
+        ialm.LOST_COUNT: experience.lost,
+        ialm.IS_VISIBLE: experience.next_configuration > 0,
+        ialm.THE_OUTCOME: outcome,
+    }
+    for start, pose in (
+        (ialm.SIDE, experience.relative_pose),
+        (ialm.MID_SIDE, middle),
+        (ialm.NEXT_SIDE, experience.next_relative_pose),
+    ):
+        shifted = motion.shifted(pose)
+        for part in range(3):
+            columns[start + part] = shifted[:, part]
+    for scalar, values in columns.items():
+        out[:, 3 * n + scalar] = values
+    return out
+
+
+def _next_counters(experience: Experience) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(whether the next row continues the episode, its waiting counter, its lost counter), each [n]."""
+    followed = np.zeros(len(experience), np.bool_)
+    followed[:-1] = (experience.episode[1:] == experience.episode[:-1]) & (experience.t[1:] == experience.t[:-1] + 1)
+    followed[:-1] &= experience.source[1:] == experience.source[:-1]
+    followed &= ~(experience.terminated | experience.truncated)
+    waiting, lost = (np.roll(counter.astype(np.int64), -1) for counter in (experience.waiting, experience.lost))
+    return followed, np.where(followed, waiting, 0), np.where(followed, lost, 0)
+
+
+def _learn_influence(dbn: TwoSliceDBN, codec: Codec, experience: Experience, parents: Parents) -> DecisionTable:
+    """pi(u | y) from whoever walks towards a goal by what it sees: the crossing expert, and persons followed."""
+    expert = experience.select(experience.source == "crossing-expert")
+    person = experience.select(
+        np.char.startswith(experience.source, "following")
+        & (experience.person_action >= 0)
+        & (experience.person_action < WAIT)
+    )
+    expert = expert.select(expert.action < WAIT)
+    codes = np.concatenate([codec.codes(expert.view), codec.codes(person.person_view)])
+    moves = np.concatenate([expert.action, person.person_action]).astype(np.int64)
+    rows, counts = np.unique(
+        np.concatenate([codes.astype(np.int64), moves[:, None]], axis=1), axis=0, return_counts=True
+    )
+    variables = np.zeros((len(rows), 3 * dbn.num_factors), np.int32)
+    variables[:, 2 * dbn.num_factors :] = rows[:, :-1]
+    return learn_distribution(variables, parents, rows[:, -1], WAIT, counts)
