@@ -8,32 +8,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from nesy.dbn import storage
 from nesy.errors import UserError
 
+if TYPE_CHECKING:
+    from domains.core import PredicateVocabulary
+
 FORMAT = "nesy-codebook"
-
-
-class Vocabulary(Protocol):
-    """What a domain says about views (see domains.core)."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the P predicates."""
-        ...
-
-    @property
-    def meanings(self) -> dict[str, str]:
-        """What each predicate means, as text."""
-        ...
-
-    def evaluate(self, views: np.ndarray) -> np.ndarray:
-        """Truth bool [n, P] of every predicate on views [n, v, v]."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +52,9 @@ class Codebook:
             raise UserError(f"a view holds a cell kind beyond {len(self.cell_kinds) - 1}")
 
     @classmethod
-    def build(cls, views: np.ndarray, codes: np.ndarray, counts: np.ndarray, vocabulary: Vocabulary | None) -> Codebook:
+    def build(
+        cls, views: np.ndarray, codes: np.ndarray, counts: np.ndarray, vocabulary: PredicateVocabulary | None
+    ) -> Codebook:
         """Make a codebook, with the truth of every predicate of `vocabulary` on every view."""
         names = tuple(vocabulary.names) if vocabulary is not None else ()
         truth = (

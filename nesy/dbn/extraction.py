@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -76,13 +77,26 @@ def extract(
         value_meanings=meanings,
         provenance=provenance,
     )
-    return with_counts(dbn, codes, actions, next_codes)
+    tables = {
+        "taken": _taken(actions, dbn.num_actions),
+        "changed": _changed(codes, actions, next_codes, dbn.num_actions),
+    }
+    return replace(with_counts(dbn, codes, actions, next_codes), tables=tables)
+
+
+def _taken(actions: np.ndarray, num_actions: int) -> np.ndarray:
+    """How often each action was taken: int64 [A]."""
+    return np.bincount(actions, minlength=num_actions).astype(np.int64)
+
+
+def _changed(codes: np.ndarray, actions: np.ndarray, next_codes: np.ndarray, num_actions: int) -> np.ndarray:
+    """In how many transitions of each action each factor changed its value: int64 [A, N]."""
+    moved = codes != next_codes
+    return np.stack([moved[np.asarray(actions) == a].sum(axis=0) for a in range(num_actions)]).astype(np.int64)
 
 
 def with_counts(dbn: TwoSliceDBN, codes: np.ndarray, actions: np.ndarray, next_codes: np.ndarray) -> TwoSliceDBN:
     """The same model with the number of the given transitions behind every row."""
-    from dataclasses import replace
-
     counts = np.zeros(len(dbn.probabilities), dtype=np.int64)
     for a in range(dbn.num_actions):
         chosen = np.asarray(actions) == a

@@ -8,6 +8,7 @@ the arcs within slice t+1; only the next belief's factorisation is an approximat
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -235,7 +236,7 @@ def _product(chosen: Sequence[Potential], scope: tuple[int, ...], sizes: dict[in
         )
     # einsum takes labels below 52 only
     labels = {v: label for label, v in enumerate(sorted({v for s, _ in chosen for v in s}))}
-    operands: list[object] = []
+    operands: list[Any] = []
     for s, table in sorted(chosen, key=lambda p: p[1].size):
         operands += [table, [labels[v] for v in s]]
     return np.asarray(np.einsum(*operands, [labels[v] for v in scope], optimize=len(chosen) > 2))

@@ -1,0 +1,210 @@
+"""The 2DBN and its codebook as ASP facts, in groups that are written only when a program mentions them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from nesy.dbn.codebook import Codebook
+from nesy.dbn.model import TwoSliceDBN
+
+SCALE = 1_000_000
+"""Probability 1 as an integer weight."""
+
+VOCABULARY: dict[str, str] = {
+    "factor(F)": "F is a factor, 0 to N-1",
+    "value(V)": "V is a value, 0 to K-1",
+    "action(A)": "A is an action: left, right, forward, stay",
+    "scale(W)": "the weight that stands for probability 1",
+    "parent(A,F,J,P,S)": "under A the J-th parent (from 1) of F in slice t+1 is factor P of slice t+S (S is 0 or 1)",
+    "arity(A,F,N)": "F has N parents under A",
+    "row(A,F,X,V,W)": "under A, with the parents' values X (a tuple), F takes the value V with weight W",
+    "likely(A,F,X,V)": "the most probable value of that row",
+    "met(A,F,X,C)": "the row was met C times in experience (rows never met have C = 0)",
+    "dropped(A,F,X,W)": "the weight of the row's values that are below the least weight written, where there is any",
+    "taken(A,C)": "action A was taken C times in experience",
+    "changed(A,F,C)": "in C of them the value of F changed",
+    "view(I)": "I is a distinct view met in experience",
+    "seen(I,C)": "view I was met C times",
+    "code(I,F,V)": "in the code of view I, factor F has the value V",
+    "cell(I,X,Y,T)": "cell (X,Y) of view I is T: empty, wall, goal or unseen (viewer at (2,4), facing y = 0)",
+    "predicate(P)": "P is an observable predicate",
+    "holds(I,P)": "P holds in view I",
+    "cooccurs(F,V,P,N,M)": "of the M distinct views with F = V, P holds in N",
+    "together(F,V,G,U,P,N,M)": "of the M distinct views with F = V and G = U (F < G), P holds in N",
+}
+"""Every predicate that a program may use, with its meaning."""
+
+
+def asp_name(name: str) -> str:
+    """A name as an ASP constant."""
+    cleaned = re.sub(r"\W", "_", name, flags=re.ASCII).strip("_") or "unnamed"
+    return cleaned if cleaned[0].islower() else f"n_{cleaned}" if cleaned[0].isdigit() else cleaned.lower()
+
+
+class Facts:
+    """Facts about one model, by predicate."""
+
+    def __init__(self, dbn: TwoSliceDBN, codebook: Codebook | None, *, all_rows: bool = False) -> None:
+        """Prepare the facts.
+
+        Args:
+            dbn: the model.
+            codebook: the views and what holds in them; without it the facts about views are empty.
+            all_rows: write the rows never met in experience too.
+        """
+        self.dbn, self.codebook, self.all_rows = dbn, codebook, all_rows
+        self.actions = tuple(asp_name(name) for name in dbn.action_names)
+        self.predicates = () if codebook is None else tuple(asp_name(n) for n in codebook.predicate_names)
+        self._writers: dict[str, Callable[[], Iterable[str]]] = {
+            "factor": lambda: [f"factor(0..{dbn.num_factors - 1})."],
+            "value": lambda: [f"value(0..{dbn.num_values - 1})."],
+            "action": lambda: [f"action({a})." for a in self.actions],
+            "scale": lambda: [f"scale({SCALE})."],
+            "parent": self._parents,
+            "arity": self._arities,
+            "row": lambda: self._rows("row"),
+            "likely": lambda: self._rows("likely"),
+            "met": lambda: self._rows("met"),
+            "dropped": lambda: self._rows("dropped"),
+            "taken": self._taken,
+            "changed": self._changed,
+            "view": lambda: [f"view(0..{len(self._book()) - 1})."] if len(self._book()) else [],
+            "seen": lambda: [f"seen({i},{c})." for i, c in enumerate(self._book().counts.tolist())],
+            "code": self._codes,
+            "cell": self._cells,
+            "predicate": lambda: [f"predicate({p})." for p in self.predicates],
+            "holds": self._holds,
+            "cooccurs": self._cooccurs,
+            "together": self._together,
+        }
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all predicates that facts exist for."""
+        return tuple(self._writers)
+
+    def mentioned(self, *programs: str) -> tuple[str, ...]:
+        """The predicates among `names` that the programs may use."""
+        words = set(re.findall(r"[a-z]\w*", " ".join(programs)))
+        return tuple(name for name in self._writers if name in words)
+
+    def text(self, names: Iterable[str]) -> str:
+        """The facts of some predicates, as program text."""
+        return "\n".join("\n".join(self._writers[name]()) for name in names) + "\n"
+
+    def dropped(self) -> float:
+        """Largest probability that the weights of `row` leave out of one row."""
+        table = self.dbn.probabilities if self.all_rows else self.dbn.probabilities[self.dbn.row_counts > 0]
+        if not len(table):
+            return 0.0
+        return float(np.where(np.round(table * SCALE) < 1, table, 0.0).sum(axis=1).max())
+
+    def _book(self) -> Codebook:
+        if self.codebook is not None:
+            return self.codebook
+        return Codebook(
+            views=np.zeros((0, 1, 1), dtype=np.uint8),
+            codes=np.zeros((0, self.dbn.num_factors), dtype=np.uint8),
+            counts=np.zeros(0, dtype=np.int64),
+            predicates=np.zeros((0, 0), dtype=bool),
+        )
+
+    def _tables(self) -> Iterable[tuple[str, int, int]]:
+        for a, action in enumerate(self.actions):
+            for i in range(self.dbn.num_factors):
+                yield action, a, i
+
+    def _parents(self) -> Iterable[str]:
+        for action, a, i in self._tables():
+            for j, (where, p) in enumerate(self.dbn.parents(a, i), 1):
+                yield f"parent({action},{i},{j},{p},{where})."
+
+    def _arities(self) -> Iterable[str]:
+        for action, a, i in self._tables():
+            yield f"arity({action},{i},{len(self.dbn.parents(a, i))})."
+
+    def _rows(self, kind: str) -> Iterable[str]:
+        for action, a, i in self._tables():
+            counts, table = self.dbn.counts(a, i), self.dbn.cpt(a, i)
+            rows = np.arange(len(table)) if self.all_rows else np.flatnonzero(counts)
+            texts = self._contexts(rows, len(self.dbn.parents(a, i)))
+            head = f"{kind}({action},{i},"
+            if kind == "row":
+                weights = np.round(table[rows] * SCALE).astype(np.int64)
+                for row, value in zip(*(index.tolist() for index in np.nonzero(weights)), strict=True):
+                    yield f"{head}{texts[row]},{value},{weights[row, value]})."
+            elif kind == "likely":
+                for text, value in zip(texts, table[rows].argmax(axis=1).tolist(), strict=True):
+                    yield f"{head}{text},{value})."
+            elif kind == "met":
+                for text, count in zip(texts, counts[rows].tolist(), strict=True):
+                    yield f"{head}{text},{count})."
+            else:
+                left = SCALE - np.round(table[rows] * SCALE).sum(axis=1).astype(np.int64)
+                for index in np.flatnonzero(left > 0).tolist():
+                    yield f"{head}{texts[index]},{left[index]})."
+
+    def _contexts(self, rows: np.ndarray, arity: int) -> list[str]:
+        """The parents' values of some rows, as tuples."""
+        k = self.dbn.num_values
+        if arity == 0:
+            return ["()"] * len(rows)
+        digits = (rows[:, None] // k ** np.arange(arity - 1, -1, -1, dtype=np.int64)) % k
+        if arity == 1:
+            return [f"({value},)" for value in digits[:, 0].tolist()]
+        return [f"({','.join(map(str, values))})" for values in digits.tolist()]
+
+    def _taken(self) -> Iterable[str]:
+        taken = self.dbn.tables.get("taken")
+        if taken is not None:
+            yield from (f"taken({a},{c})." for a, c in zip(self.actions, taken.tolist(), strict=True))
+
+    def _changed(self) -> Iterable[str]:
+        changed = self.dbn.tables.get("changed")
+        if changed is not None:
+            for action, a, i in self._tables():
+                yield f"changed({action},{i},{int(changed[a, i])})."
+
+    def _codes(self) -> Iterable[str]:
+        for i, code in enumerate(self._book().codes.tolist()):
+            yield " ".join(f"code({i},{f},{v})." for f, v in enumerate(code))
+
+    def _cells(self) -> Iterable[str]:
+        book = self._book()
+        kinds = [asp_name(kind) for kind in book.cell_kinds]
+        for i, view in enumerate(book.views.tolist()):
+            yield " ".join(
+                f"cell({i},{x},{y},{kinds[cell]})." for x, column in enumerate(view) for y, cell in enumerate(column)
+            )
+
+    def _holds(self) -> Iterable[str]:
+        views, predicates = np.nonzero(self._book().predicates)
+        for i, p in zip(views.tolist(), predicates.tolist(), strict=True):
+            yield f"holds({i},{self.predicates[p]})."
+
+    def _cooccurs(self) -> Iterable[str]:
+        book, k = self._book(), self.dbn.num_values
+        truth = book.predicates.astype(np.int64)
+        for f in range(self.dbn.num_factors if len(book) else 0):
+            chosen = (book.codes[:, f] == np.arange(k)[:, None]).astype(np.int64)
+            hits, totals = (chosen @ truth).tolist(), chosen.sum(axis=1).tolist()
+            for v in range(k):
+                if totals[v]:
+                    for p, name in enumerate(self.predicates):
+                        yield f"cooccurs({f},{v},{name},{hits[v][p]},{totals[v]})."
+
+    def _together(self) -> Iterable[str]:
+        book, k = self._book(), self.dbn.num_values
+        truth = book.predicates.astype(np.int64)
+        for f in range(self.dbn.num_factors if len(book) else 0):
+            for g in range(f + 1, self.dbn.num_factors):
+                pair = book.codes[:, f].astype(np.int64) * k + book.codes[:, g]
+                chosen = (pair == np.arange(k * k)[:, None]).astype(np.int64)
+                totals, hits = chosen.sum(axis=1), chosen @ truth
+                for c in np.flatnonzero(totals).tolist():
+                    v, u = divmod(c, k)
+                    for p, name in enumerate(self.predicates):
+                        yield f"together({f},{v},{g},{u},{name},{hits[c, p]},{totals[c]})."

@@ -1,0 +1,348 @@
+"""The knowledge base of a run: its 2DBN and codebook, questions ready to ask, and any program of the user's.
+
+Loads neither the network nor the domain: what a question needs was written when the 2DBN was extracted.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import clingo
+
+from nesy.asp.facts import Facts, asp_name
+from nesy.asp.solver import Answer, solve
+from nesy.asp.sources import read_sources
+from nesy.dbn.codebook import Codebook
+from nesy.dbn.model import TwoSliceDBN
+from nesy.errors import UserError
+
+ENCODINGS = Path(__file__).with_name("encodings")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The answer to a ready question."""
+
+    question: str
+    """The question in words."""
+    text: str
+    """The answer in words, for people."""
+    rows: tuple[dict[str, Any], ...]
+    """The answer as data."""
+    seconds: float
+    """Wall time."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON values."""
+        return {**asdict(self), "rows": list(self.rows)}
+
+
+class KnowledgeBase:
+    """Questions about one model."""
+
+    def __init__(self, dbn: TwoSliceDBN, codebook: Codebook | None = None) -> None:
+        """A knowledge base over a model, with the views met in experience where a codebook is given."""
+        self.dbn, self.codebook = dbn, codebook
+        self.facts = Facts(dbn, codebook)
+
+    @classmethod
+    def from_run(cls, path: Path | str) -> KnowledgeBase:
+        """The knowledge base of a run folder.
+
+        Raises:
+            UserError: the folder is no run, lacks the step `extract`, or its files are damaged.
+        """
+        from nesy.run_folder import RunFolder
+
+        run = RunFolder.open(path)
+        run.require("extract")
+        return cls.from_folder(run.dbn)
+
+    @classmethod
+    def from_folder(cls, path: Path | str) -> KnowledgeBase:
+        """The knowledge base of a folder with a 2DBN and its codebook.
+
+        Raises:
+            UserError: the files are missing or damaged.
+        """
+        return cls(TwoSliceDBN.load(path), Codebook.load(path))
+
+    # ---------------------------------------------------------------- ready questions
+    def means(self, factor: int | str, value: int, least: float = 0.95) -> Finding:
+        """What does factor F = V mean?
+
+        Args:
+            factor: number or name of the factor.
+            value: the value.
+            least: share of the views with the value in which a predicate must hold to be implied.
+
+        Raises:
+            UserError: no such factor or value.
+        """
+        started = time.perf_counter()
+        f = self.factor(factor)
+        if not 0 <= value < self.dbn.num_values:
+            raise UserError(f"no value {value}; the values of a factor are 0 to {self.dbn.num_values - 1}")
+        book = self._book()
+        facts = self.facts.text(("cooccurs", "predicate"))
+        totals = "".join(
+            f"seen_of({name},{count},{len(book)})."
+            for name, count in zip(self.facts.predicates, book.predicates.sum(axis=0).tolist(), strict=True)
+        )
+        atoms = self._ask("meaning", f"asked({f},{value}). least({_percent(least)}). {totals} {facts}")
+        rows: list[dict[str, Any]] = [
+            {
+                "relation": atom.name,
+                "predicate": self._predicate_name(atom.arguments[0].name),
+                "views": atom.arguments[1].number,
+                "of": atom.arguments[2].number,
+                "of_all_views": self._share(atom.arguments[0].name),
+            }
+            for atom in atoms
+            if atom.arguments
+        ]
+        order = {"means": 0, "excludes": 1, "mixed": 2}
+        rows.sort(key=lambda r: (order[r["relation"]], -abs(r["views"] / r["of"] - r["of_all_views"]), r["predicate"]))
+        name = f"{self.dbn.factor_names[f]} = {value}"
+        return self._finding(f"What does {name} mean?", self._meaning_text(name, rows), rows, started)
+
+    def influenced(self, action: int | str) -> Finding:
+        """Which factors does action A change, and through which parents?
+
+        Raises:
+            UserError: no such action.
+        """
+        started = time.perf_counter()
+        a = self.action(action)
+        facts = self.facts.text(("taken", "changed", "parent"))
+        atoms = self._ask("influence", f"asked({self.facts.actions[a]}). {facts}")
+        parents: dict[int, list[str]] = {i: [] for i in range(self.dbn.num_factors)}
+        changes = dict.fromkeys(range(self.dbn.num_factors), (0, 0))
+        for atom in atoms:
+            numbers = [argument.number for argument in atom.arguments[1:]]
+            if atom.name == "through":
+                parents[numbers[0]].append(self.dbn.factor_names[numbers[1]] + ("'" if numbers[2] else ""))
+            elif atom.name == "changes":
+                changes[numbers[0]] = (numbers[1], numbers[2])
+        rows: list[dict[str, Any]] = [
+            {
+                "factor": self.dbn.factor_names[i],
+                "changed": changes[i][0],
+                "of": changes[i][1],
+                "parents": sorted(parents[i]),
+            }
+            for i in sorted(changes, key=lambda i: (-changes[i][0], i))
+        ]
+        name = self.dbn.action_names[a]
+        moved = [r for r in rows if r["changed"]]
+        lines = [f"'{name}' changes {len(moved)} of {len(rows)} factors:"]
+        lines += [
+            f"  {r['factor']}  in {_percentage(r['changed'], r['of'])} of {r['of']} transitions, "
+            f"decided by {', '.join(r['parents']) or 'nothing'}"
+            for r in moved
+        ]
+        kept = [r["factor"] for r in rows if not r["changed"]]
+        if kept:
+            lines.append(f"  never changed: {', '.join(kept)}")
+        return self._finding(f"Which factors does '{name}' change?", "\n".join(lines), rows, started)
+
+    def implies(self, predicate: str, least: float = 0.95) -> Finding:
+        """Which values, alone or two together, mean that a predicate holds?
+
+        Args:
+            predicate: name of an observable predicate.
+            least: share of the views with the value in which the predicate must hold.
+
+        Raises:
+            UserError: no such predicate.
+        """
+        started = time.perf_counter()
+        book = self._book()
+        truth = book.predicate(predicate)
+        facts = self.facts.text(("cooccurs", "together"))
+        atoms = self._ask("implies", f"asked({asp_name(predicate)}). least({_percent(least)}). {facts}")
+        rows = []
+        for atom in atoms:
+            numbers = [argument.number for argument in atom.arguments]
+            values = list(zip(numbers[:-2:2], numbers[1:-2:2], strict=True))
+            covered = np_all(book, values) & truth
+            rows.append(
+                {
+                    "values": [{"factor": self.dbn.factor_names[f], "value": v} for f, v in values],
+                    "views": numbers[-2],
+                    "of": numbers[-1],
+                    "covers": round(float(covered.sum() / max(1, truth.sum())), 4),
+                    "_covered": covered,
+                }
+            )
+        rows.sort(key=lambda r: (len(r["values"]), -r["covers"], str(r["values"])))
+        chosen, rows = _greedy_cover(rows)
+        text = self._implies_text(predicate, chosen, len(rows), int(truth.sum()), len(book))
+        return self._finding(f"Which values mean that {predicate} holds?", text, rows, started)
+
+    # ---------------------------------------------------------------- any program
+    def query(
+        self,
+        program: str | Path,
+        rules: Sequence[str | Path] = (),
+        models: int = 1,
+        time_limit: float = 10.0,
+        memory_mb: int = 2048,
+    ) -> Answer:
+        """Solve any ASP program over the facts of the model (nesy.asp.VOCABULARY lists them).
+
+        The program is text from a stranger: it runs in a process of its own, without script blocks and
+        without files outside its folder, and is stopped at its limits.
+
+        Args:
+            program: program text, or the `Path` of a file.
+            rules: further texts or `Path`s.
+            models: how many models at most; 0 for all.
+            time_limit: seconds for grounding and solving.
+            memory_mb: memory for grounding and solving.
+
+        Raises:
+            UserError: the program is wrong, or does not ground within its limits.
+        """
+        sources = read_sources([program, *rules])
+        mentioned = self.facts.mentioned(*(source.text for source in sources))
+        uses_weights = bool({"row", "dropped"} & set(mentioned))
+        return solve(
+            sources,
+            self.facts.text(mentioned),
+            self.facts.names,
+            models=models,
+            time_limit=time_limit,
+            memory_mb=memory_mb,
+            dropped=self.facts.dropped() if uses_weights else 0.0,
+        )
+
+    # ---------------------------------------------------------------- names
+    def factor(self, factor: int | str) -> int:
+        """The number of a factor given by number or name.
+
+        Raises:
+            UserError: there is none such.
+        """
+        if isinstance(factor, str) and factor in self.dbn.factor_names:
+            return self.dbn.factor_names.index(factor)
+        if isinstance(factor, str) and re.fullmatch(r"\d+", factor):
+            factor = int(factor)
+        if isinstance(factor, int) and 0 <= factor < self.dbn.num_factors:
+            return factor
+        names = ", ".join(self.dbn.factor_names)
+        raise UserError(f"no factor '{factor}'; the factors are 0 to {self.dbn.num_factors - 1} ({names})")
+
+    def action(self, action: int | str) -> int:
+        """The number of an action given by number or name.
+
+        Raises:
+            UserError: there is none such.
+        """
+        if isinstance(action, str) and action in self.dbn.action_names:
+            return self.dbn.action_names.index(action)
+        if isinstance(action, int) and 0 <= action < self.dbn.num_actions:
+            return action
+        raise UserError(f"no action '{action}'; the actions are {', '.join(self.dbn.action_names)}")
+
+    def _book(self) -> Codebook:
+        if self.codebook is None or not len(self.codebook):
+            raise UserError("this model has no codebook: its values have no meaning in views")
+        return self.codebook
+
+    def _predicate_name(self, constant: str) -> str:
+        return self._book().predicate_names[self.facts.predicates.index(constant)]
+
+    def _share(self, constant: str) -> float:
+        return round(float(self._book().predicates[:, self.facts.predicates.index(constant)].mean()), 4)
+
+    def _ask(self, encoding: str, facts: str) -> list[clingo.Symbol]:
+        """The shown atoms of one of our own encodings; no limits are needed, it is known to end."""
+        control = clingo.Control(["--warn=none"])
+        control.load(str(ENCODINGS / f"{encoding}.lp"))
+        control.add("base", [], facts)
+        control.ground([("base", [])])
+        atoms: list[clingo.Symbol] = []
+        control.solve(on_model=lambda model: atoms.extend(model.symbols(shown=True)))
+        return sorted(atoms)
+
+    def _finding(self, question: str, text: str, rows: Sequence[dict[str, Any]], started: float) -> Finding:
+        return Finding(question, text, tuple(rows), round(time.perf_counter() - started, 4))
+
+    def _meaning_text(self, name: str, rows: Sequence[dict[str, Any]]) -> str:
+        if not rows:
+            return f"{name}: no view met in experience has this value."
+        lines = [f"{name} ({rows[0]['of']} of {len(self._book())} distinct views):"]
+        words = {"means": "holds", "excludes": "does not hold"}
+        for row in rows:
+            if row["relation"] in words:
+                share = _percentage(row["views"], row["of"])
+                lines.append(
+                    f"  {row['predicate']} {words[row['relation']]}: true in {share} of them, "
+                    f"in {100 * row['of_all_views']:.1f} % of all views"
+                )
+        mixed = [r for r in rows if r["relation"] == "mixed"][:3]
+        if len(lines) == 1:
+            lines.append("  no predicate is decided by this value alone; the nearest:")
+            lines += [
+                f"  {r['predicate']}: true in {_percentage(r['views'], r['of'])} of them, "
+                f"in {100 * r['of_all_views']:.1f} % of all views"
+                for r in mixed
+            ]
+        return "\n".join(lines)
+
+    def _implies_text(
+        self, predicate: str, chosen: Sequence[dict[str, Any]], total: int, positive: int, views: int
+    ) -> str:
+        head = f"{predicate} holds in {positive} of {views} distinct views."
+        if not chosen:
+            return f"{head}\n  No value and no pair of values implies it."
+        lines = [head, f"  {total} values or pairs imply it; these cover what can be covered:"]
+        for row in chosen:
+            values = " and ".join(f"{v['factor']} = {v['value']}" for v in row["values"])
+            lines.append(
+                f"  {values}: true in {row['views']} of {row['of']} views, covers {100 * row['covers']:.1f} % "
+                f"of the views with {predicate} (so far {100 * row['covered_so_far']:.1f} %)"
+            )
+        return "\n".join(lines)
+
+
+def np_all(book: Codebook, values: Sequence[tuple[int, int]]) -> Any:
+    """Which views have all the values (factor, value): bool [V]."""
+    chosen = book.counts >= 0
+    for factor, value in values:
+        chosen = chosen & (book.codes[:, factor] == value)
+    return chosen
+
+
+def _greedy_cover(rows: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """A small choice of rows that together cover all that any row covers; and the rows as plain data."""
+    masks = [row.pop("_covered") for row in rows]
+    if not rows:
+        return [], []
+    covered = masks[0] & False
+    total = max(1.0, *(mask.sum() / max(row["covers"], 1e-9) for mask, row in zip(masks, rows, strict=True)))
+    chosen: list[dict[str, Any]] = []
+    while True:
+        gains = [int((mask & ~covered).sum()) for mask in masks]
+        best = max(range(len(rows)), key=lambda j: (gains[j], -len(rows[j]["values"]), -j))
+        if not gains[best]:
+            return chosen, rows
+        covered = covered | masks[best]
+        rows[best]["covered_so_far"] = round(float(covered.sum() / total), 4)
+        chosen.append(rows[best])
+
+
+def _percent(share: float) -> int:
+    if not 0.5 < share <= 1:
+        raise UserError(f"the least share must lie between 0.5 and 1, found {share}")
+    return round(100 * share)
+
+
+def _percentage(part: int, whole: int) -> str:
+    return f"{100 * part / max(1, whole):.1f} %"
