@@ -12,12 +12,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from nesy.errors import UserError
 from nesy.run_folder import RunFolder
+
+if TYPE_CHECKING:
+    from nesy.asp import Answer, KnowledgeBase
 
 
 @dataclass(frozen=True)
@@ -69,10 +72,43 @@ def run(options: Arguments) -> dict[str, Any]:
     if options.predicate is not None:
         return knowledge.implies(options.predicate).to_dict()
     if options.vocabulary:
-        return knowledge.vocabulary().to_dict()
+        return _vocabulary(knowledge)
     assert options.program is not None
     answer = knowledge.query(options.program, rules=options.rules, models=options.models, time_limit=options.time_limit)
-    return answer.to_dict()
+    return {**answer.to_dict(), "text": _answer_text(answer)}
+
+
+def _vocabulary(knowledge: KnowledgeBase) -> dict[str, Any]:
+    from nesy.asp import VOCABULARY
+
+    book = knowledge.codebook
+    predicates = {} if book is None else dict(zip(book.predicate_names, book.predicate_meanings, strict=True))
+    lines = []
+    for title, words in (("Facts that a program can use:", VOCABULARY), ("Observable predicates P:", predicates)):
+        width = max(map(len, words), default=0)
+        lines += [title, *(f"  {name:{width}}  {meaning}" for name, meaning in words.items())]
+    return {"facts": dict(VOCABULARY), "predicates": predicates, "text": "\n".join(lines)}
+
+
+def _answer_text(answer: Answer) -> str:
+    """The models, one per paragraph, and what is known about completeness."""
+    lines = []
+    for number, (atoms, cost) in enumerate(zip(answer.models, answer.costs, strict=True), start=1):
+        suffix = f" (cost {' '.join(map(str, cost))})" if cost else ""
+        lines += [f"Model {number}{suffix}:", *(f"  {atom}" for atom in atoms)]
+    if answer.satisfiable is None:
+        lines.append("No answer within the time limit.")
+    elif not answer.satisfiable:
+        lines.append("No model: the program is unsatisfiable.")
+    elif not answer.exhausted:
+        lines.append("There may be further models (--models 0 for all, --time-limit for longer).")
+    if not answer.optimal:
+        lines.append("Not proven optimal within the time limit.")
+    if answer.dropped:
+        lines.append(f"The facts leave out at most {answer.dropped:.2g} of a row's probability.")
+    lines += [f"Note: {note}" for note in answer.notes]
+    lines.append(f"{answer.seconds['total']:.3f} s")
+    return "\n".join(lines)
 
 
 def _factor_and_value(text: str) -> tuple[int, int]:

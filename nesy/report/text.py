@@ -19,7 +19,7 @@ COMPARISON_COLUMNS = (
 
 def comparison_rows(cells: list[dict[str, Any]]) -> list[tuple[str, ...]]:
     """One row of text per cell of the comparison, in the order of `COMPARISON_COLUMNS`."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for cell in cells:
         share = cell.get("share_of_optimum")
         rows.append(

@@ -1,0 +1,213 @@
+"""The whole pipeline on a tiny run: what it leaves, what it repeats, what it refuses, what damage gives."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from nesy.cli.main import main
+from nesy.report.text import comparison_rows
+
+TINY = [
+    *("--preset", "smoke", "--jobs", "1"),
+    *("--collect.crossing-episodes", "60", "--collect.following-episodes", "60"),
+    *("--train.epochs", "2"),
+    *("--compare.dqn.episodes", "64", "--compare.planner-episodes", "2", "--compare.episodes", "42"),
+    *("--compare.search.pomdp-py-simulations", "4"),
+]
+INFLUENCES = ("random", "perspective-shift", "perfect-information")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "tiny run"
+    assert main(["run", "--run", str(folder), *TINY]) == 0
+    return folder
+
+
+@pytest.fixture
+def copy(run: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(run, tmp_path / "copy"))
+
+
+def _error(capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line of a mistake; progress lines come before it."""
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert sum(line.startswith("nesy: ") for line in lines) == 1
+    assert "Traceback" not in "\n".join(lines)
+    return lines[-1]
+
+
+def test_the_run_folder_holds_what_the_contract_says(run: Path) -> None:
+    for name in (
+        "config.json",
+        "experience/part-00000.parquet",
+        "world_model/model.safetensors",
+        "world_model/config.json",
+        "world_model/metrics.jsonl",
+        "dbn/model.json",
+        "dbn/tables.npz",
+        "ialm",
+        "policies",
+        "results/episodes.parquet",
+        "summary.json",
+        "report.html",
+    ):
+        assert (run / name).exists(), name
+    assert not [path for path in run.rglob("*") if "tmp" in path.name]
+    policies = list((run / "policies").glob("*.safetensors"))
+    assert len(policies) == len(INFLUENCES)
+
+
+def test_the_summary_has_every_section(run: Path) -> None:
+    summary = json.loads((run / "summary.json").read_text())
+    gates = (
+        "views_exact",
+        "cells",
+        "distinct_codes",
+        "distinct_views",
+        "next_code_nll",
+        "next_view_exact",
+        "next_view_cells",
+    )
+    for name in gates:
+        assert name in summary["world_model"], name
+    for name in ("max_difference_to_network", "nll", "rows", "max_parents"):
+        assert name in summary["dbn"], name
+    assert summary["dbn"]["max_difference_to_network"] <= 1e-6
+    cells = {(cell["agent"], cell["influence"]) for cell in summary["comparison"]}
+    for influence in INFLUENCES:
+        assert ("dqn", influence) in cells
+        assert ("pomdp", influence) in cells
+    optimum = next(cell for cell in summary["comparison"] if cell["agent"] == "optimum")
+    assert optimum["return"]["mean"] == pytest.approx(90.3, abs=0.5)
+    assert optimum["success"]["mean"] == pytest.approx(0.807, abs=0.01)
+    assert set(summary["timing"]) == {"collect", "train", "extract", "compare", "report"}
+    assert {"versions", "seed", "machine"} <= set(summary["provenance"])
+
+
+def test_means_of_the_table_are_those_of_the_episodes(run: Path) -> None:
+    summary = json.loads((run / "summary.json").read_text())
+    rows = pq.read_table(run / "results" / "episodes.parquet").to_pylist()
+    for cell in summary["comparison"]:
+        returns = [
+            row["return"]
+            for row in rows
+            if row["phase"] == "eval"
+            and row["agent"] == cell["agent"]
+            and (row["influence"] or "") == (cell["influence"] or "")
+            and (row["inputs"] or "") == (cell["inputs"] or "")
+        ]
+        if returns:
+            assert cell["return"]["mean"] == pytest.approx(sum(returns) / len(returns), abs=1e-3)
+            assert cell["episodes"] == len(returns)
+
+
+def test_the_page_is_self_contained_and_its_table_comes_from_the_summary(run: Path) -> None:
+    page = (run / "report.html").read_text(encoding="utf-8")
+    summary = json.loads((run / "summary.json").read_text())
+    for row in comparison_rows(summary["comparison"]):
+        assert all(f">{text}<" in page for text in row if text)
+    for anchor in ("comparison", "learning", "belief", "world-model", "dbn", "provenance"):
+        assert f'<section id="{anchor}">' in page
+    assert page.count("<svg") >= 3
+    # nothing is loaded: SVG namespaces and metadata are names, not addresses that a browser fetches
+    assert not re.search(r'(?:src|href)="(?!#)', re.sub(r'xlink:href="#', "", page))
+    assert "<script" not in page
+
+
+def test_running_again_repeats_nothing(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    kept = (
+        "experience/part-00000.parquet",
+        "world_model/model.safetensors",
+        "dbn/tables.npz",
+        "results/episodes.parquet",
+    )
+    before = {name: (run / name).read_bytes() for name in kept}
+    assert main(["run", "--run", str(run), *TINY]) == 0
+    assert {name: (run / name).read_bytes() for name in kept} == before
+    assert "optimum" in capsys.readouterr().out
+
+
+def test_other_settings_for_a_finished_step_are_refused(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (run / "config.json").read_bytes()
+    assert main(["train", "--run", str(run), "--epochs", "7"]) == 2
+    assert "train.epochs: 2, now 7" in _error(capsys)
+    assert (run / "config.json").read_bytes() == before
+
+
+def test_json_is_one_object_on_standard_output(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["extract", "--run", str(run), "--json"]) == 0
+    assert "rows" in json.loads(capsys.readouterr().out)
+
+
+def test_the_table_can_be_read(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["extract", "--run", str(run), "--factor", "0", "--action", "forward"]) == 0
+    assert "forward" in capsys.readouterr().out
+    assert main(["extract", "--run", str(run), "--factor", "8"]) == 2
+    assert "the factors are 0 to 7" in _error(capsys)
+    assert main(["extract", "--run", str(run), "--action", "jump"]) == 2
+    assert "the actions are left" in _error(capsys)
+
+
+@pytest.mark.parametrize(
+    "question", [["--means", "0=0"], ["--changes", "forward"], ["--predicate", "wall_ahead"], ["--vocabulary"]]
+)
+def test_questions_are_answered(question: list[str], run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["query", "--run", str(run), *question]) == 0
+    assert capsys.readouterr().out.strip()
+    assert main(["query", "--run", str(run), *question, "--json"]) == 0
+    assert isinstance(json.loads(capsys.readouterr().out), dict)
+
+
+@pytest.mark.parametrize(
+    ("question", "expected"),
+    [
+        (["--means", "8=0"], "factor"),
+        (["--means", "0=8"], "value"),
+        (["--means", "zero"], "FACTOR=VALUE"),
+        (["--changes", "jump"], "jump"),
+        (["--predicate", "wall_behind_me"], "wall_behind_me"),
+        (["--program", "/nonexistent.lp"], "nonexistent.lp"),
+    ],
+)
+def test_wrong_questions(question: list[str], expected: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["query", "--run", str(run), *question]) == 2
+    assert expected in _error(capsys)
+
+
+DAMAGE = {
+    "empty": lambda content: b"",
+    "truncated": lambda content: content[: len(content) // 2],
+    "overwritten": lambda content: b"\x00garbage" + content[8:],
+}
+
+
+@pytest.mark.parametrize("damage", sorted(DAMAGE))
+@pytest.mark.parametrize(
+    ("file", "command", "removed"),
+    [
+        ("experience/part-00000.parquet", "train", "world_model"),
+        ("world_model/model.safetensors", "extract", "dbn"),
+        ("dbn/tables.npz", "compare", "results"),
+        ("dbn/model.json", "query --means 0=0", None),
+        ("results/episodes.parquet", "report", None),
+        ("config.json", "train", None),
+        ("summary.json", "report", None),
+    ],
+)
+def test_a_damaged_file_gives_one_line(
+    file: str, command: str, removed: str | None, damage: str, copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if removed is not None:
+        shutil.rmtree(copy / removed)
+    path = copy / file
+    path.write_bytes(DAMAGE[damage](path.read_bytes()))
+    capsys.readouterr()
+    assert main([*command.split(), "--run", str(copy)]) == 2
+    assert path.name in _error(capsys)
