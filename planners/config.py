@@ -62,6 +62,8 @@ class DQNConfig:
     """Whether the online network chooses the action that the target network values."""
     prioritised: bool = False
     """Whether replay prefers transitions with a large error."""
+    bootstrap: Literal["timeout", "truncated"] = "timeout"
+    """Which endings are only the clock's, so that the value of what would have followed counts."""
     published_terminals: bool = False
     """As the published code: bootstrap from terminal transitions as if the episode went on."""
     published_target_start: bool = False

@@ -109,6 +109,7 @@ class IALM:
         motion: how the relative pose c changes.
         tables: one `DecisionTable` per name in `TABLES`.
         initial_poses: int16 [M, 3] relative poses at the start of episodes, with `initial_pose_counts` [M].
+        leaf_values: float64 [2W + 1, 2W + 1, 4, L], see planners.bounds.
         initial_waiting: counts [W] of the waiting counter at the start of episodes.
         view_size: side of the robot's view.
         provenance: where the tables come from (JSON values).
@@ -120,6 +121,7 @@ class IALM:
     initial_poses: np.ndarray
     initial_pose_counts: np.ndarray
     initial_waiting: np.ndarray
+    leaf_values: np.ndarray
     view_size: int
     provenance: dict[str, Any]
 
@@ -205,6 +207,7 @@ class IALM:
         arrays["initial.poses"] = self.initial_poses
         arrays["initial.pose_counts"] = self.initial_pose_counts
         arrays["initial.waiting"] = self.initial_waiting
+        arrays["leaf.values"] = self.leaf_values
         with atomic_path(folder / "tables.npz") as temporary, temporary.open("wb") as stream:
             np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
         description = {
@@ -247,9 +250,14 @@ class IALM:
             names, kinds = description["names"], description["kinds"]
             tables = {
                 name: DecisionTable(
-                    *(arrays[f"{name}.{part}"] for part in _TABLE_ARRAYS),
-                    str(kinds[name]),
-                    {int(slot): str(text) for slot, text in names[name].items()},
+                    slot=arrays[f"{name}.slot"],
+                    value=arrays[f"{name}.value"],
+                    ordered=arrays[f"{name}.ordered"],
+                    yes=arrays[f"{name}.yes"],
+                    no=arrays[f"{name}.no"],
+                    moments=arrays[f"{name}.moments"],
+                    kind=str(kinds[name]),
+                    names={int(slot): str(text) for slot, text in names[name].items()},
                 )
                 for name in TABLES
             }
@@ -264,6 +272,7 @@ class IALM:
                 initial_poses=arrays["initial.poses"],
                 initial_pose_counts=arrays["initial.pose_counts"],
                 initial_waiting=arrays["initial.waiting"],
+                leaf_values=arrays["leaf.values"],
                 view_size=int(description["view_size"]),
                 provenance=dict(description["provenance"]),
             )

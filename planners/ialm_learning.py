@@ -9,6 +9,7 @@ import numpy as np
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
 from planners import ialm
+from planners.bounds import relational_values
 from planners.ialm import FORWARD, IALM, SCALARS, STAY, TIMEOUT, WAIT, Codec
 from planners.motion import RelativeMotion, learn_motion
 from planners.tables import DecisionTable, Parents, learn_distribution, learn_mean
@@ -20,7 +21,11 @@ _ORDERED = {"side", "ahead", "waiting", "lost"}
 
 
 def learn_ialm(
-    dbn: TwoSliceDBN, codec: Codec, experience: Experience, provenance: dict[str, Any] | None = None
+    dbn: TwoSliceDBN,
+    codec: Codec,
+    experience: Experience,
+    provenance: dict[str, Any] | None = None,
+    discount: float = 0.9,
 ) -> IALM:
     """Learn every table from experience.
 
@@ -29,6 +34,7 @@ def learn_ialm(
         codec: turns views into codes.
         experience: transitions of person following (all tables), and of the crossing task's expert (pi only).
         provenance: recorded with the model.
+        discount: per step, for the leaf values.
     """
     following = experience.select(np.char.startswith(experience.source, "following"))
     if len(following) == 0:
@@ -99,6 +105,7 @@ def learn_ialm(
         initial_poses=poses.astype(np.int16),
         initial_pose_counts=counts.astype(np.int64),
         initial_waiting=np.bincount(following.waiting[first].clip(0)).astype(np.int64),
+        leaf_values=_leaf_values(motion, variables[:, 3 * n :], following, discount),
         view_size=int(following.view.shape[-1]),
         provenance=dict(provenance or {}),
     )
@@ -152,6 +159,26 @@ def _next_counters(experience: Experience) -> tuple[np.ndarray, np.ndarray, np.n
     followed &= ~(experience.terminated | experience.truncated)
     waiting, lost = (np.roll(counter.astype(np.int64), -1) for counter in (experience.waiting, experience.lost))
     return followed, np.where(followed, waiting, 0), np.where(followed, lost, 0)
+
+
+def _leaf_values(motion: RelativeMotion, scalars: np.ndarray, experience: Experience, discount: float) -> np.ndarray:
+    """The relational part of the experience, solved (planners.bounds)."""
+    next_pose = scalars[:, ialm.NEXT_SIDE : ialm.NEXT_SIDE + 3]
+    arrival = np.concatenate([next_pose, scalars[:, [ialm.NEXT_LOST_COUNT]]], axis=1)
+    departure = np.concatenate([next_pose, scalars[:, [ialm.LOST_COUNT]]], axis=1)
+    pose = Parents(("side", "ahead", "heading"), (0, 1, 2), (True, True, False))
+    pose_and_lost = Parents((*pose.names, "lost"), (0, 1, 2, 3), (*pose.ordered, True))
+    ended = (scalars[:, ialm.THE_OUTCOME] > 0).astype(np.int64)
+    lost_after = scalars[:, ialm.NEXT_LOST_COUNT].astype(np.int64)
+    middle = scalars[:, ialm.MID_SIDE : ialm.MID_SIDE + 3]
+    return relational_values(
+        motion,
+        learn_distribution(middle, pose, scalars[:, ialm.PERSON].astype(np.int64), WAIT + 1),
+        learn_mean(arrival, pose_and_lost, experience.reward),
+        learn_distribution(arrival, pose_and_lost, ended, 2),
+        learn_distribution(departure, pose_and_lost, lost_after, int(lost_after.max()) + 1),
+        discount,
+    )
 
 
 def _learn_influence(dbn: TwoSliceDBN, codec: Codec, experience: Experience, parents: Parents) -> DecisionTable:
