@@ -15,6 +15,8 @@ import time
 from typing import Any
 
 MAX_OUTPUT = 64 << 20
+PATIENCE = 0.2
+"""Seconds spent on whether there are further models once those asked for are found."""
 
 
 def main() -> None:
@@ -44,7 +46,7 @@ def _solve(task: dict[str, Any]) -> None:
             messages.append((code.name, message))
 
     started = time.monotonic()
-    control = clingo.Control(["--opt-mode=optN", f"--models={task['models']}"], logger=log)
+    control = clingo.Control(["--opt-mode=optN", f"--models={task['models'] + 1}"], logger=log)
     has_show = False
     try:
         with ast.ProgramBuilder(control) as builder:
@@ -78,15 +80,21 @@ def _solve(task: dict[str, Any]) -> None:
     deadline = started + float(task["time_limit"])
     # models are asked for one by one: between two of them, and while waiting, the deadline is looked at
     with control.solve(yield_=True, async_=True) as handle:
-        stopped = False
+        stopped = more = False
         while True:
             handle.resume()
             if not handle.wait(max(0.0, deadline - time.monotonic())):
                 handle.cancel()
-                stopped = True
+                # the answers asked for are there: whether there are more is not worth waiting for
+                stopped = found < task["models"]
+                more = True
                 break
             model = handle.model()
             if model is None:
+                break
+            if found == task["models"]:
+                handle.cancel()
+                more = True
                 break
             atoms = sorted(
                 str(symbol)
@@ -101,6 +109,8 @@ def _solve(task: dict[str, Any]) -> None:
             best = None
             found += 1
             written += _write(line)
+            if found == task["models"]:
+                deadline = min(deadline, time.monotonic() + PATIENCE)
             if written > MAX_OUTPUT:
                 _write({"error": f"the answers are longer than {MAX_OUTPUT >> 20} MB", "kind": "output"})
                 return
@@ -112,7 +122,7 @@ def _solve(task: dict[str, Any]) -> None:
         {
             "result": {
                 "satisfiable": True if found or best is not None else result.satisfiable,
-                "exhausted": bool(result.exhausted) and not stopped,
+                "exhausted": bool(result.exhausted) and not more,
                 "optimal": found > 0,
                 "stopped": stopped,
                 "ground_s": grounded - started,

@@ -44,6 +44,7 @@ def extract(
     next_codes: np.ndarray,
     *,
     action_names: Sequence[str] | None = None,
+    factor_names: Sequence[str] | None = None,
     initial_codes: np.ndarray | None = None,
     meanings: Sequence[Sequence[str]] = (),
     provenance: dict[str, Any] | None = None,
@@ -56,6 +57,7 @@ def extract(
         actions: integers [n].
         next_codes: uint8 [n, N].
         action_names: A names.
+        factor_names: N names; `X0`, `X1`, ... by default.
         initial_codes: uint8 [m, N], codes at the start of episodes; the initial distribution is theirs.
         meanings: [N][K] texts.
         provenance: where the model comes from, JSON values.
@@ -73,6 +75,7 @@ def extract(
         [[now for now, _ in per_action] for per_action in structure],
         [[later for _, later in per_action] for per_action in structure],
         action_names=action_names,
+        factor_names=factor_names,
         initial=None if initial_codes is None else marginals(initial_codes, cpts[0][0].shape[-1]),
         value_meanings=meanings,
         provenance=provenance,

@@ -1,0 +1,138 @@
+"""Exact inference against brute force over all codes."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nesy.dbn import inference
+from nesy.dbn.kernels import packed, sample_codes
+from nesy.errors import UserError
+from tests.nesy.dbn.models import all_codes, joint, marginals_of, random_dbn, transition_matrix
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_belief(rng, dbn):
+    belief = rng.dirichlet(np.full(dbn.num_values, 0.5), size=dbn.num_factors)
+    # some rows certain, some with values ruled out
+    belief[0] = np.eye(dbn.num_values)[rng.integers(dbn.num_values)]
+    belief[-1] = np.where(belief[-1] < 0.1, 0, belief[-1])
+    return belief / belief.sum(axis=1, keepdims=True)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seeds)
+def test_predict_is_the_marginal_of_the_joint(seed):
+    rng = np.random.default_rng(seed)
+    dbn = random_dbn(rng, zeros=seed % 2 == 0)
+    belief = random_belief(rng, dbn)
+    for action in range(dbn.num_actions):
+        expected = marginals_of(joint(belief) @ transition_matrix(dbn, action), dbn)
+        np.testing.assert_allclose(dbn.predict(belief, action), expected, atol=1e-12)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seeds)
+def test_filter_is_bayes_rule(seed):
+    rng = np.random.default_rng(seed)
+    dbn = random_dbn(rng)
+    belief = random_belief(rng, dbn)
+    likelihood = rng.random(belief.shape)
+    likelihood[1] = 0.7  # says nothing
+    posterior = (joint(belief) @ transition_matrix(dbn, 1)) * joint(likelihood)
+    expected = marginals_of(posterior / posterior.sum(), dbn)
+    np.testing.assert_allclose(dbn.filter(belief, 1, likelihood), expected, atol=1e-12)
+
+
+def test_filter_falls_back_to_the_observation_when_it_is_impossible():
+    rng = np.random.default_rng(3)
+    dbn = random_dbn(rng, zeros=True, max_parents=1, concentration=0.1)
+    code = np.zeros(3, dtype=int)
+    impossible = np.argwhere(dbn.predict(np.eye(3)[code], 0) == 0)
+    factor, value = impossible[0]
+    likelihood = np.ones((3, 3))
+    likelihood[factor] = np.eye(3)[value]
+    likelihood[(factor + 1) % 3] = 0
+    posterior = dbn.filter(np.eye(3)[code], 0, likelihood)
+    np.testing.assert_allclose(posterior.sum(axis=1), 1)
+    assert posterior[factor, value] == 1
+    other = (factor + 1) % 3
+    np.testing.assert_allclose(posterior[other], dbn.predict(np.eye(3)[code], 0)[other])
+
+
+@settings(max_examples=20, deadline=None)
+@given(seeds)
+def test_plan_marginals_chain_steps_exactly(seed):
+    rng = np.random.default_rng(seed)
+    dbn = random_dbn(rng)
+    belief = random_belief(rng, dbn)
+    plan = rng.integers(0, 2, size=3).tolist()
+    distribution = joint(belief)
+    for action in plan:
+        distribution = distribution @ transition_matrix(dbn, action)
+    expected = distribution.reshape((3,) * 3)
+    result = inference.plan_marginals(dbn, belief, plan, (2, 0))
+    np.testing.assert_allclose(result, expected.sum(axis=1).T, atol=1e-12)
+
+
+def test_plan_marginals_with_evidence_on_the_way():
+    rng = np.random.default_rng(5)
+    dbn = random_dbn(rng)
+    belief = random_belief(rng, dbn)
+    distribution = joint(belief) @ transition_matrix(dbn, 0)
+    distribution = distribution * (all_codes(dbn)[:, 1] == 2)
+    expected = marginals_of(distribution @ transition_matrix(dbn, 1), dbn)[0]
+    result = inference.plan_marginals(dbn, belief, [0, 1], (0,), evidence={(1, 1): 2})
+    np.testing.assert_allclose(result, expected, atol=1e-12)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seeds)
+def test_joint_next_and_log_prob_agree_with_the_matrix(seed):
+    rng = np.random.default_rng(seed)
+    dbn = random_dbn(rng, zeros=True)
+    codes = all_codes(dbn)
+    matrix = transition_matrix(dbn, 0)
+    start = int(rng.integers(len(codes)))
+    later, weights = inference.joint_next(dbn, codes[start], 0)
+    index = later.astype(int) @ [9, 3, 1]
+    found = np.zeros(len(codes))
+    found[index] = weights
+    np.testing.assert_allclose(found, matrix[start], atol=1e-12)
+    assert (np.diff(weights) <= 0).all()
+    with np.errstate(divide="ignore"):
+        np.testing.assert_allclose(dbn.log_prob(codes[start], 0, codes), np.log(matrix[start]), atol=1e-9)
+
+
+def test_samples_have_the_model_s_frequencies_and_do_not_depend_on_the_kernel():
+    rng = np.random.default_rng(1)
+    dbn = random_dbn(rng)
+    codes = np.tile(np.array([1, 2, 0], dtype=np.uint8), (20_000, 1))
+    actions = np.ones(len(codes), dtype=np.int64)
+    drawn = dbn.sample(codes, actions, np.random.default_rng(7))
+    uniforms = np.random.default_rng(7).random(codes.shape)
+    np.testing.assert_array_equal(sample_codes(packed(dbn), codes, actions, uniforms), drawn)
+    frequencies = np.bincount(drawn.astype(int) @ [9, 3, 1], minlength=27) / len(codes)
+    row = transition_matrix(dbn, 1)[1 * 9 + 2 * 3]
+    assert np.abs(frequencies - row).max() < 5 * np.sqrt(0.25 / len(codes))
+
+
+def test_most_probable_next_of_a_deterministic_model_is_its_only_next():
+    rng = np.random.default_rng(2)
+    dbn = random_dbn(rng, concentration=1e-3)
+    codes = all_codes(dbn)
+    later, weights = inference.most_probable_next(dbn, codes, 0)
+    np.testing.assert_allclose(np.log(weights), dbn.log_prob(codes, 0, later), atol=1e-9)
+
+
+def test_wrong_arguments_are_named():
+    dbn = random_dbn(np.random.default_rng(0))
+    with pytest.raises(UserError, match="shape"):
+        dbn.predict(np.ones((2, 3)) / 3, 0)
+    with pytest.raises(UserError, match="distribution"):
+        dbn.predict(np.ones((3, 3)), 0)
+    with pytest.raises(UserError, match="action"):
+        dbn.predict(np.ones((3, 3)) / 3, 2)
+    with pytest.raises(UserError, match="values"):
+        dbn.log_prob(np.array([0, 0, 3]), 0, np.array([0, 0, 0]))

@@ -1,0 +1,104 @@
+"""Files written and read back."""
+
+import csv
+
+import clingo
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from nesy import formats
+from nesy.errors import UserError
+from tests.nesy.dbn.models import random_dbn
+from tests.nesy.dbn.test_storage import same
+from tests.nesy.dbn.toy import toy
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.integers(0, 2**32 - 1))
+@pytest.mark.parametrize("name", ["native", "parquet"])
+def test_round_trips_are_bit_equal(tmp_path, name, seed):
+    dbn = random_dbn(np.random.default_rng(seed))
+    path = tmp_path / f"{seed}{formats.FORMATS[name].suffix}"
+    formats.export(dbn, path)
+    assert same(formats.read(path), dbn)
+
+
+def test_parquet_keeps_everything_else_too(tmp_path):
+    dbn = toy()[0]
+    formats.export(dbn, tmp_path / "m.parquet")
+    assert same(formats.read(tmp_path / "m.parquet"), dbn)
+    table = pq.read_table(tmp_path / "m.parquet")
+    row = table.slice(9 + 9 + 3, 1).to_pylist()[0]
+    assert table.num_rows == dbn.probabilities.size
+    assert row["action"] == "swap" and row["factor"] == "goal" and row["parents"] == ["goal"]
+    assert (row["parent_values"], row["value"], row["probability"], row["count"]) == ([1], 0, 0.0, 4)
+
+
+def test_csv_holds_every_probability_exactly(tmp_path):
+    dbn = random_dbn(np.random.default_rng(1))
+    formats.export(dbn, tmp_path / "m.csv")
+    with (tmp_path / "m.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    np.testing.assert_array_equal([float(row["probability"]) for row in rows], dbn.probabilities.reshape(-1))
+    a, i = 1, 2
+    start = int(dbn.offsets[a, i]) * 3
+    names = [dbn.factor_names[p] + ("'" if where else "") for where, p in dbn.parents(a, i)]
+    assert rows[start]["parents"] == " ".join(f"{name}=0" for name in names)
+    assert (rows[start]["action"], rows[start]["factor"]) == ("a1", "X2")
+
+
+def test_asp_facts_are_a_program_that_clingo_takes(tmp_path):
+    dbn = toy()[0]
+    formats.export(dbn, tmp_path / "m.lp")
+    control = clingo.Control()
+    control.load(str(tmp_path / "m.lp"))
+    control.ground([("base", [])])
+    rows = sum(1 for _ in control.symbolic_atoms.by_signature("row", 5))
+    assert rows == int((dbn.probabilities > 0).sum())
+
+
+def test_wrong_formats_and_places_are_explained(tmp_path):
+    dbn = toy()[0]
+    with pytest.raises(UserError, match="no format"):
+        formats.export(dbn, tmp_path / "m.doc")
+    with pytest.raises(UserError, match="no format 'word'"):
+        formats.export(dbn, tmp_path / "m", format="word")
+    with pytest.raises(UserError, match="is a folder"):
+        formats.export(dbn, tmp_path, format="csv")
+    with pytest.raises(UserError, match="no such file"):
+        formats.read(tmp_path / "none.parquet")
+    formats.export(dbn, tmp_path / "m.csv")
+    with pytest.raises(UserError, match="cannot be read back"):
+        formats.read(tmp_path / "m.csv")
+
+
+def test_damaged_parquet_gives_one_line(tmp_path):
+    path = tmp_path / "m.parquet"
+    formats.export(toy()[0], path)
+    content = path.read_bytes()
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        damaged = bytearray(content)
+        for position in rng.integers(0, len(content), size=8):
+            damaged[position] ^= int(rng.integers(1, 256))
+        path.write_bytes(damaged[: int(rng.integers(len(content) // 2, len(content) + 1))])
+        try:
+            formats.read(path)
+        except UserError as error:
+            assert "\n" not in str(error)
+
+
+def test_parquet_of_something_else_and_in_another_order_is_refused(tmp_path):
+    path = tmp_path / "m.parquet"
+    pq.write_table(pa.table({"a": [1]}), path)
+    with pytest.raises(UserError):
+        formats.read(path)
+    formats.export(toy()[0], path)
+    table = pq.read_table(path)
+    pq.write_table(table.take(list(range(table.num_rows))[::-1]), path)
+    with pytest.raises(UserError, match=r"order|distribution"):
+        formats.read(path)
