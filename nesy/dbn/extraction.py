@@ -16,20 +16,37 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from nesy.dbn.codebook import Codebook, distinct_views, value_meanings
-from nesy.dbn.model import TwoSliceDBN
+from nesy.dbn.model import Parents, TwoSliceDBN
 from nesy.errors import UserError
 
 if TYPE_CHECKING:
     from nesy.run_folder import RunFolder
 
-Structure = Sequence[Sequence[tuple[Sequence[int], Sequence[int]]]]
+
+class Structure(Protocol):
+    """Who depends on whom, in the words of `TwoSliceDBN`."""
+
+    @property
+    def parents_now(self) -> Parents:
+        """[a][i]: parents in slice t."""
+        ...
+
+    @property
+    def parents_next(self) -> Parents:
+        """[a][i]: parents in slice t+1."""
+        ...
+
+    @property
+    def order(self) -> tuple[int, ...]:
+        """The order in which the factors of slice t+1 are decided."""
+        ...
 
 
 class Conditionals(Protocol):
     """A network that decides each next factor from few parents."""
 
     def structure(self) -> Structure:
-        """[a][i]: the parents of factor i under action a, in slice t and in slice t+1."""
+        """Who depends on whom."""
         ...
 
     def conditional(self, action: int, factor: int) -> np.ndarray:
@@ -68,12 +85,13 @@ def extract(
     structure = model.structure()
     cpts = [
         [np.asarray(model.conditional(a, i), dtype=np.float64) for i in range(len(per_action))]
-        for a, per_action in enumerate(structure)
+        for a, per_action in enumerate(structure.parents_now)
     ]
     dbn = TwoSliceDBN.from_tables(
         cpts,
-        [[now for now, _ in per_action] for per_action in structure],
-        [[later for _, later in per_action] for per_action in structure],
+        structure.parents_now,
+        structure.parents_next,
+        order=structure.order,
         action_names=action_names,
         factor_names=factor_names,
         initial=None if initial_codes is None else marginals(initial_codes, cpts[0][0].shape[-1]),

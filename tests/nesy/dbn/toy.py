@@ -44,8 +44,12 @@ def encode_views(views: np.ndarray) -> np.ndarray:
 class Network:
     """Action 0 swaps front and left; action 1 clears the front where it is free, else nothing changes."""
 
-    def structure(self) -> list[list[tuple[tuple[int, ...], tuple[int, ...]]]]:
-        return [[((1,), ()), ((0,), ()), ((2,), ())], [((0,), ()), ((1, 0), ()), ((2,), (0,))]]
+    def structure(self) -> TwoSliceDBN:
+        return TwoSliceDBN.from_tables(
+            [[self.conditional(action, factor) for factor in range(3)] for action in range(2)],
+            [[[1], [0], [2]], [[0], [1, 0], [2]]],
+            [[[], [], []], [[], [], [0]]],
+        )
 
     def conditional(self, action: int, factor: int) -> np.ndarray:
         eye = np.eye(3)
