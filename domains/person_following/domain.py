@@ -1,0 +1,77 @@
+"""The Domain object of person following: what `load_domain("person_following")` returns."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from domains.core import DomainSpec, OracleResult, ViewGeometry
+from domains.person_following.enumeration import all_maps, all_views
+from domains.person_following.predicates import ViewPredicates
+from domains.person_following.variants import VARIANTS, parameters_of
+from domains.person_following.vector_env import PersonFollowingVectorEnv
+
+
+class PersonFollowing:
+    """The domain of the paper and its variants."""
+
+    spec = DomainSpec(name="person_following", variants=tuple(VARIANTS))
+
+    @property
+    def predicates(self) -> ViewPredicates:
+        """The observable predicates of a 5 x 5 view."""
+        return self.predicates_of(self.spec.geometry)
+
+    @staticmethod
+    def predicates_of(geometry: ViewGeometry) -> ViewPredicates:
+        """The observable predicates of views of another size."""
+        return ViewPredicates(geometry)
+
+    def make(
+        self,
+        task: str,
+        num_envs: int,
+        variant: str = "paper",
+        seed: int | None = None,
+        maps: NDArray[np.uint8] | None = None,
+        cycle: bool = False,
+        **parameters: Any,
+    ) -> PersonFollowingVectorEnv:
+        """A batched environment; see `domains.core.Domain.make`."""
+        env = PersonFollowingVectorEnv(
+            num_envs=num_envs, task=task, variant=variant, maps=maps, cycle=cycle, **parameters
+        )
+        env.pending_seed = seed
+        return env
+
+    def maps(
+        self, variant: str = "paper", **parameters: Any
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+        """The distinct maps as generated, sorted, and the generator's probabilities."""
+        grids, weights = _maps(variant, tuple(sorted(parameters.items())))
+        return grids.copy(), weights.copy()
+
+    def views(self, variant: str = "paper", task: str = "following", **parameters: Any) -> NDArray[np.uint8]:
+        """All distinct views over maps and poses, sorted; person following adds those of the freed cell."""
+        grids, _ = _maps(variant, tuple(sorted(parameters.items())))
+        return all_views(grids, parameters_of(variant, task, **parameters), following=task == "following")
+
+    def optimum(self, variant: str = "paper", discount: float = 0.9, **parameters: Any) -> OracleResult:
+        """The exact full-state optimum over the maps of a variant, weighted as the generator draws them."""
+        from domains.person_following.oracles import full_state_optimum
+
+        grids, weights = _maps(variant, tuple(sorted(parameters.items())))
+        return full_state_optimum(grids, weights, parameters_of(variant, **parameters), discount)
+
+
+@lru_cache(maxsize=16)
+def _maps(
+    variant: str, parameters: tuple[tuple[str, Any], ...]
+) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    return all_maps(parameters_of(variant, **dict(parameters)))
+
+
+DOMAIN = PersonFollowing()

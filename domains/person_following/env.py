@@ -1,0 +1,103 @@
+"""The task as a single Gymnasium environment, over the same compiled rules as the batched one."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from domains.core import OUTCOMES, ViewGeometry
+from domains.person_following.random_numbers import stream_of, write_back
+from domains.person_following.vector_env import NUM_ACTIONS, Batch, checked_actions, observation_space
+
+
+class PersonFollowingEnv(gymnasium.Env):  # type: ignore[misc]
+    """One environment of the person-following or the crossing task.
+
+    Observation: `view` uint8 [v, v] of cell kinds indexed [vx, vy], the person removed, and `configuration`,
+    0 where the person is unseen. Actions: left, right, forward, stay.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": [], "render_fps": 6}
+
+    def __init__(
+        self,
+        task: str = "following",
+        variant: str = "paper",
+        render_mode: str | None = None,
+        maps: NDArray[np.uint8] | None = None,
+        cycle: bool = False,
+        **parameters: Any,
+    ) -> None:
+        """Make an environment of a variant, with single parameters changed by keyword."""
+        self.batch = Batch(task, 1, variant, maps, cycle, parameters)
+        self.observation_space = observation_space(self.batch.geometry)
+        self.action_space = spaces.Discrete(NUM_ACTIONS)
+        self.render_mode = render_mode
+        self._actions = np.zeros(1, np.int64)
+
+    @property
+    def geometry(self) -> ViewGeometry:
+        """Coordinates of the view."""
+        return self.batch.geometry
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin an episode.
+
+        Args:
+            seed: seeds the environment's generator; None goes on with the present one.
+            options: `grid` [size, size] (0 empty, 1 wall, 2 goal) to start on, `waiting` (0..2) to start with.
+
+        Raises:
+            DomainError: a grid that cannot be played, or an unknown option; the state is then as it was.
+        """
+        batch = self.batch
+        kept = batch.world.stream[0].copy()
+        super().reset(seed=seed)
+        batch.world.stream[0] = stream_of(self.np_random)
+        try:
+            batch.begin(options)
+        except ValueError:
+            batch.world.stream[0] = kept
+            raise
+        write_back(batch.world.stream[0], self.np_random)
+        last = batch.last
+        observation = {"view": last.robot_view[0].copy(), "configuration": last.configuration[0]}
+        return observation, {"distance": int(last.distance[0]), "visible": bool(last.visible[0])}
+
+    def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Take one action.
+
+        Raises:
+            DomainError: not a whole number in 0..3; the state is then as it was.
+        """
+        if type(action) is int and 0 <= action < NUM_ACTIONS:
+            self._actions[0] = action
+        else:
+            self._actions[:] = checked_actions(np.asarray(action).reshape(-1), 1)
+        self.batch.step(self._actions, False)
+        last = self.batch.last
+        info = {
+            "distance": int(last.distance[0]),
+            "visible": bool(last.visible[0]),
+            "person_action": int(last.person_action[0]),
+            "person_waited": bool(last.person_action[0] == 3),
+        }
+        terminated, truncated = bool(last.terminated[0]), bool(last.truncated[0])
+        if terminated or truncated:
+            info["outcome"] = OUTCOMES[last.outcome[0]]
+        observation = {"view": last.robot_view[0], "configuration": last.configuration[0]}
+        return observation, float(last.reward[0]), terminated, truncated, info
+
+    def state(self) -> dict[str, Any]:
+        """The full state: grid, agent, person, goal, waiting, lost, t; plain numbers and a copy of the grid."""
+        return self.batch.state(0)
+
+    def expert_action(self, kind: str) -> int:
+        """First action of the A* path on the full map, to the `goal` or, as a `follower`, to the person."""
+        return int(self.batch.expert(kind)[0])

@@ -1,0 +1,158 @@
+"""Parameters of the task, and variants as named sets of their values."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from domains.core import DomainError
+from domains.person_following.map_generation import MAX_SIZE
+from domains.person_following.paths import HEADING_ALWAYS, HEADING_NEVER, HEADING_UNLESS_0
+
+# Columns of the vector of rules that the kernel reads.
+(
+    R_NUM_CROSSINGS,
+    R_SEE_THROUGH,
+    R_MAX_STEPS,
+    R_FOLLOW_DISTANCE,
+    R_MAX_LOST,
+    R_LOOK_BACK,
+    R_PERSON_REST,
+    R_ROBOT_REST,
+    R_GOAL_PATIENCE,
+    R_PERSON_START,
+    R_KEEP_WAITING,
+    R_FOLLOWING,
+    R_MAP_SOURCE,
+    NUM_RULES,
+) = range(14)
+
+GENERATED, DRAWN, CYCLED = 0, 1, 2
+"""Where the maps of new episodes come from (R_MAP_SOURCE)."""
+
+START_CORNER, START_FREE = 0, 1
+_HEADINGS = {"never": HEADING_NEVER, "always": HEADING_ALWAYS, "unless-0": HEADING_UNLESS_0}
+_STARTS = {"corner": START_CORNER, "free": START_FREE}
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Every rule of the task that can be changed; the defaults are the `paper` variant.
+
+    Steps that count from 1 within an episode are written t.
+    """
+
+    size: int = 9
+    """Width and height of the map, border walls included; odd, 5 to 31."""
+    num_crossings: int = 1
+    """Number of rivers of wall."""
+    view_size: int = 5
+    """Width and height of the egocentric view; odd, 3 to 15."""
+    see_through_walls: bool = True
+    """Whether walls hide what is behind them (False) or not (True)."""
+    max_steps: int = 200
+    """t at which an episode is cut off."""
+    follow_distance: int = 3
+    """Greatest distance at which the robot still follows."""
+    max_lost: int = 3
+    """Steps in a row beyond the follow distance after which the person is lost."""
+    look_back: bool = True
+    """Whether the person waits, at most two steps in a row, for a robot unseen or too far."""
+    person_rest: int = 0
+    """The person stays where t is a multiple of this; 0 for never."""
+    robot_rest: int = 0
+    """The robot stays where t is a multiple of this, whatever it chooses; 0 for never."""
+    goal_patience: int = 0
+    """Steps the person stands at its goal before the episode ends unescorted where the robot is too far."""
+    compare_heading: Literal["never", "always", "unless-0"] = "unless-0"
+    """When a path to the person must end in its heading; `unless-0` is the quirk of the paper."""
+    person_start: Literal["corner", "free"] = "corner"
+    """`corner`: at (2, 2), cutting a wall there (the quirk of the paper); `free`: on a free cell."""
+    keep_waiting: bool = True
+    """Whether the waiting counter lives on into the next episode (the quirk of the paper)."""
+
+    def __post_init__(self) -> None:
+        """Check every value.
+
+        Raises:
+            DomainError: a value outside its range.
+        """
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            wanted = type(field.default)
+            if wanted is int and isinstance(value, np.integer):
+                object.__setattr__(self, field.name, int(value))
+            elif type(value) is not wanted:
+                raise DomainError(f"parameter '{field.name}' must be {wanted.__name__}, got {value!r}")
+        if self.size % 2 == 0 or not 5 <= self.size <= MAX_SIZE:
+            raise DomainError(f"size must be odd and in 5..{MAX_SIZE}, got {self.size}")
+        feasible = self.size - 3
+        if not 0 <= self.num_crossings <= feasible:
+            raise DomainError(
+                f"num_crossings must be in 0..{feasible} for size {self.size}, got {self.num_crossings}"
+            )
+        if self.view_size % 2 == 0 or not 3 <= self.view_size <= 15:
+            raise DomainError(f"view_size must be odd and in 3..15, got {self.view_size}")
+        for name in ("max_steps", "max_lost"):
+            if getattr(self, name) < 1:
+                raise DomainError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("follow_distance", "person_rest", "robot_rest", "goal_patience"):
+            if getattr(self, name) < 0:
+                raise DomainError(f"{name} must not be negative, got {getattr(self, name)}")
+        for name in ("person_rest", "robot_rest"):
+            if getattr(self, name) == 1:
+                raise DomainError(f"{name} must be 0 (never) or at least 2, got 1: nobody would ever move")
+        for name, known in (("compare_heading", _HEADINGS), ("person_start", _STARTS)):
+            if getattr(self, name) not in known:
+                raise DomainError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
+
+    @property
+    def heading_rule(self) -> int:
+        """The kernel's number for `compare_heading`."""
+        return _HEADINGS[self.compare_heading]
+
+    def rules(self, *, following: bool, map_source: int = GENERATED) -> NDArray[np.int64]:
+        """The vector that the kernel reads, indexed by the R_ constants."""
+        rules = np.zeros(NUM_RULES, np.int64)
+        rules[R_NUM_CROSSINGS] = self.num_crossings
+        rules[R_SEE_THROUGH] = self.see_through_walls
+        rules[R_MAX_STEPS] = self.max_steps
+        rules[R_FOLLOW_DISTANCE] = self.follow_distance
+        rules[R_MAX_LOST] = self.max_lost
+        rules[R_LOOK_BACK] = self.look_back
+        rules[R_PERSON_REST] = self.person_rest
+        rules[R_ROBOT_REST] = self.robot_rest
+        rules[R_GOAL_PATIENCE] = self.goal_patience
+        rules[R_PERSON_START] = _STARTS[self.person_start]
+        rules[R_KEEP_WAITING] = self.keep_waiting
+        rules[R_FOLLOWING] = following
+        rules[R_MAP_SOURCE] = map_source
+        return rules
+
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "paper": {},
+}
+
+
+def parameters_of(variant: str = "paper", task: str = "following", **changes: Any) -> Parameters:
+    """The parameters of a variant, with some of them changed by keyword.
+
+    Raises:
+        DomainError: an unknown variant or parameter, or a value outside its range.
+    """
+    if variant not in VARIANTS:
+        raise DomainError(f"unknown variant '{variant}': known are {', '.join(VARIANTS)}")
+    known = {field.name for field in dataclasses.fields(Parameters)}
+    unknown = sorted(set(changes) - known)
+    if unknown:
+        raise DomainError(f"unknown parameter '{unknown[0]}': known are {', '.join(sorted(known))}")
+    values = VARIANTS[variant] | changes
+    if task == "crossing" and "max_steps" not in changes:
+        size = values.get("size", Parameters.size)
+        values["max_steps"] = 4 * size * size if isinstance(size, int) else 1
+    return Parameters(**values)
