@@ -243,7 +243,8 @@ def train(
     target = _initialised(ValueNetwork(state.shape[1], num_actions, config), generator)
     if not config.published_target_start:
         target.load_state_dict(network.state_dict())
-    weights, target_weights = list(network.parameters()), list(target.parameters())
+    weights: list[torch.Tensor] = list(network.parameters())
+    target_weights: list[torch.Tensor] = list(target.parameters())
     optimiser = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
     replay = Replay(config.memory, config.num_envs, state.shape[1])
     finished: list[tuple[float, int, int, int]] = []

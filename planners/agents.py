@@ -1,0 +1,116 @@
+"""What an agent is to the comparison: something that sees a batch of situations and acts in each.
+
+percepts (x, b, b~, configuration), the last actions  ->  actions [B]
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from domains.core import BatchedEnvironment, ViewGeometry
+from planners.beliefs import ParticleBelief
+from planners.config import SearchConfig
+from planners.dqn import DQNPolicy
+from planners.ialm import IALM
+from planners.kernels import compile_model
+from planners.perception import Percepts
+
+
+class Situation(NamedTuple):
+    """One moment in B environments.
+
+    Attributes:
+        env: the environments; only oracles look into them.
+        observation: `view` [B, V, V] and `configuration` [B].
+        percepts: what perception makes of it; None for agents that do without.
+        active: bool [B], where the episode still goes on; actions elsewhere are ignored.
+        last_actions: int64 [B], what was done before; None at the start of the episodes.
+    """
+
+    env: BatchedEnvironment
+    observation: dict[str, np.ndarray]
+    percepts: Percepts | None
+    active: np.ndarray
+    last_actions: np.ndarray | None
+
+
+class Agent(Protocol):
+    """Acts in a batch of episodes, from their starts to their ends."""
+
+    def actions(self, situation: Situation) -> np.ndarray:
+        """Actions int64 [B]."""
+        ...
+
+
+class DQNAgent:
+    """Acts greedily on a trained belief DQN."""
+
+    def __init__(self, policy: DQNPolicy) -> None:
+        self.policy = policy
+
+    def actions(self, situation: Situation) -> np.ndarray:
+        """Greedy actions."""
+        assert situation.percepts is not None
+        return self.policy.actions(situation.percepts)
+
+
+class Planner(Protocol):
+    """Chooses an action for a belief, int16 [P, 2N + 5]."""
+
+    def plan(self, belief: np.ndarray) -> tuple[int, dict[str, object]]:
+        """The action, and what the search saw."""
+        ...
+
+
+class PlanningAgent:
+    """Keeps a particle belief per episode and plans in it with pomdp-py's POUCT or our own search.
+
+    Every episode has random streams of its own, so results do not depend on which episodes run side by side.
+    """
+
+    def __init__(self, kind: str, model: IALM, config: SearchConfig, geometry: ViewGeometry, seed: int) -> None:
+        self.kind, self.model, self.config, self.geometry, self.seed = kind, model, config, geometry, seed
+        self.compiled = compile_model(model)
+        self.beliefs: list[ParticleBelief] = []
+        self.planners: list[Planner] = []
+        self.infos: list[dict[str, object]] = []
+
+    def actions(self, situation: Situation) -> np.ndarray:
+        """Update the beliefs of the active episodes and plan in each."""
+        percepts = situation.percepts
+        assert percepts is not None
+        count = len(situation.active)
+        if situation.last_actions is None:
+            self._begin(count)
+        actions = np.zeros(count, np.int64)
+        self.infos = [{} for _ in range(count)]
+        poses = self.geometry.relative(percepts.configurations)
+        for i in np.flatnonzero(situation.active):
+            pose = poses[i] if percepts.configurations[i] > 0 else None
+            belief = self.beliefs[i]
+            if situation.last_actions is None:
+                belief.reset(percepts.codes[i], pose, percepts.shifted[i])
+            else:
+                belief.update(int(situation.last_actions[i]), percepts.codes[i], pose, percepts.shifted[i])
+            actions[i], self.infos[i] = self.planners[i].plan(belief.states)
+        return actions
+
+    def _begin(self, count: int) -> None:
+        self.beliefs, self.planners = [], []
+        for i in range(count):
+            filtering, planning = (
+                np.random.default_rng(child) for child in np.random.SeedSequence([self.seed, i]).spawn(2)
+            )
+            self.beliefs.append(ParticleBelief(self.model, self.compiled, self.config.particles, filtering))
+            self.planners.append(self._planner(planning))
+
+    def _planner(self, rng: np.random.Generator) -> Planner:
+        if self.kind == "pomdp":
+            from planners.pomdp_py_adapter import POUCTAgent
+
+            return POUCTAgent(self.model, self.compiled, self.config, rng)
+        from planners.search import IALMSearch
+
+        return IALMSearch(self.model, self.compiled, self.config, rng)
