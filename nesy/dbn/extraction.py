@@ -1,14 +1,15 @@
-"""Extraction of the 2DBN: from a network whose conditionals are tables already, by exact enumeration.
+"""Extraction of the 2DBN of a run, and of any network whose conditionals are tables already.
 
 The `symbolic` architecture decides every next factor from few parents, so that each of its conditionals
 can be enumerated over all parent values: the table is the network, nothing is fitted. Counts of the
 transitions met in experience stand behind every row; a row with count 0 is the network's guess.
+Other architectures are fitted (nesy.dbn.fitting).
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -21,6 +22,9 @@ from nesy.errors import UserError
 
 if TYPE_CHECKING:
     from nesy.run_folder import RunFolder
+
+Marginals = Callable[[np.ndarray, int], np.ndarray]
+"""Codes uint8 [n, N] and an action -> marginals of the next factors, float64 [n, N, K]."""
 
 
 class Structure(Protocol):
@@ -98,35 +102,28 @@ def extract(
         value_meanings=meanings,
         provenance=provenance,
     )
-    tables = {
-        "taken": _taken(actions, dbn.num_actions),
-        "changed": _changed(codes, actions, next_codes, dbn.num_actions),
-    }
-    return replace(with_counts(dbn, codes, actions, next_codes), tables=tables)
-
-
-def _taken(actions: np.ndarray, num_actions: int) -> np.ndarray:
-    """How often each action was taken: int64 [A]."""
-    return np.bincount(actions, minlength=num_actions).astype(np.int64)
-
-
-def _changed(codes: np.ndarray, actions: np.ndarray, next_codes: np.ndarray, num_actions: int) -> np.ndarray:
-    """In how many transitions of each action each factor changed its value: int64 [A, N]."""
-    moved = codes != next_codes
-    return np.stack([moved[np.asarray(actions) == a].sum(axis=0) for a in range(num_actions)]).astype(np.int64)
+    return with_counts(dbn, codes, actions, next_codes)
 
 
 def with_counts(dbn: TwoSliceDBN, codes: np.ndarray, actions: np.ndarray, next_codes: np.ndarray) -> TwoSliceDBN:
-    """The same model with the number of the given transitions behind every row."""
+    """The same model with the number of the given transitions behind every row.
+
+    Also sets the tables `taken` int64 [A], how often each action was taken, and `changed` int64 [A, N], in how
+    many of its transitions each factor changed its value.
+    """
     counts = np.zeros(len(dbn.probabilities), dtype=np.int64)
+    taken = np.zeros(dbn.num_actions, dtype=np.int64)
+    changed = np.zeros((dbn.num_actions, dbn.num_factors), dtype=np.int64)
     for a in range(dbn.num_actions):
         chosen = np.asarray(actions) == a
+        taken[a] = chosen.sum()
+        changed[a] = (codes[chosen] != next_codes[chosen]).sum(axis=0)
         now, later = codes[chosen].astype(np.int64), next_codes[chosen].astype(np.int64)
         for i in range(dbn.num_factors):
             start = dbn.offsets[a, i]
             rows = dbn.num_rows(a, i)
             counts[start : start + rows] = np.bincount(dbn.rows(a, i, now, later), minlength=rows)
-    return replace(dbn, row_counts=counts)
+    return replace(dbn, row_counts=counts, tables={**dbn.tables, "taken": taken, "changed": changed})
 
 
 def marginals(codes: np.ndarray, num_values: int) -> np.ndarray:
@@ -152,28 +149,43 @@ def extract_run(run: RunFolder, domain_name: str) -> dict[str, Any]:
     if not len(experience):
         raise UserError(f"{run.experience}: holds no transitions")
     model = load_world_model(run.world_model)
-    transitions = encode(experience, SymbolicCodec(model))
+    codec = SymbolicCodec(model)
+    transitions = encode(experience, codec)
     codebook = Codebook.build(transitions.views, transitions.view_codes, transitions.view_counts, domain.predicates)
-    dbn = extract(
-        model,
-        transitions.codes,
-        transitions.actions,
-        transitions.next_codes,
-        action_names=domain.spec.action_names,
-        initial_codes=transitions.codes[experience.t == 0] if (experience.t == 0).any() else None,
-        meanings=value_meanings(codebook, int(model.num_values)),
-        provenance={
+    described: dict[str, Any] = {
+        "action_names": domain.spec.action_names,
+        "initial_codes": transitions.codes[experience.t == 0] if (experience.t == 0).any() else None,
+        "meanings": value_meanings(codebook, int(model.num_values)),
+        "provenance": {
             "source": "network",
             "domain": domain_name,
             "architecture": str(model.architecture),
             "world_model_sha256": _digest(run.world_model / "model.safetensors"),
             "transitions": len(experience),
         },
-    )
+    }
+    taken = (transitions.codes, transitions.actions, transitions.next_codes)
+    exact = hasattr(model, "conditional")
+    if exact:
+        dbn = extract(model, *taken, **described)
+    else:
+        from nesy.dbn.fitting import from_callable
+
+        dbn = from_callable(network_marginals(codec), *taken, num_values=int(model.num_values), **described)
     codebook.save(run.dbn)
     # last: the step counts as done when model.json is there
     dbn.save(run.dbn)
-    return fidelity(TwoSliceDBN.load(run.dbn), model, transitions)
+    return fidelity(TwoSliceDBN.load(run.dbn), model if exact else network_marginals(codec), transitions)
+
+
+def network_marginals(codec: Any) -> Marginals:
+    """The next factors' marginals as the network of a codec predicts them from a certain code."""
+
+    def predict(codes: np.ndarray, action: int) -> np.ndarray:
+        beliefs = np.eye(codec.num_values, dtype=np.float32)[codes]
+        return np.asarray(codec.predict(beliefs, np.full(len(codes), action)), dtype=np.float64)
+
+    return predict
 
 
 class Transitions:

@@ -6,27 +6,29 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from nesy.dbn.factored import predict_batch
 from nesy.dbn.model import TwoSliceDBN
 
 if TYPE_CHECKING:
-    from nesy.dbn.extraction import Conditionals, Transitions
+    from nesy.dbn.extraction import Conditionals, Marginals, Transitions
 
 FLOOR = 1e-12
 """Least probability that a likelihood is charged with, so that one impossible row does not hide the rest."""
 
 
-def fidelity(dbn: TwoSliceDBN, model: Conditionals | None, transitions: Transitions) -> dict[str, Any]:
+def fidelity(dbn: TwoSliceDBN, model: Conditionals | Marginals | None, transitions: Transitions) -> dict[str, Any]:
     """The figures of the `dbn` section of summary.json.
 
     Args:
         dbn: the extracted model.
-        model: the network it comes from; None for a model counted from experience.
+        model: the network it comes from, or what it predicts; None for a model counted from experience.
         transitions: the experience to measure on.
 
     Returns:
         `nll`: mean negative log-likelihood of a transition in nats (probabilities below 1e-12 count as
         1e-12, their share is `impossible`), `nll_limit`: the least that any model can have on the same
-        transitions; `max_difference_to_network` over every entry of every table; `rows`, `rows_met`,
+        transitions; `max_difference_to_network`: over every entry of every table where the network has
+        tables, else of the predicted marginals of every code met; `rows`, `rows_met`,
         `max_parents`, `next_arcs` (arcs within slice t+1), `codes_met`.
     """
     figures: dict[str, Any] = {
@@ -38,9 +40,21 @@ def fidelity(dbn: TwoSliceDBN, model: Conditionals | None, transitions: Transiti
         "views_met": len(transitions.views),
     }
     figures |= nll(dbn, transitions.codes, transitions.actions, transitions.next_codes)
-    if model is not None:
+    if hasattr(model, "conditional"):
         figures["max_difference_to_network"] = max_difference(dbn, model)
+    elif model is not None:
+        figures["max_difference_to_network"] = max_marginal_difference(dbn, model, transitions.view_codes)
     return figures
+
+
+def max_marginal_difference(dbn: TwoSliceDBN, predict: Marginals, codes: np.ndarray) -> float:
+    """The largest difference between predicted marginals of table and network, over some codes [n, N]."""
+    kinds = np.unique(codes, axis=0)
+    largest = 0.0
+    for a in range(dbn.num_actions):
+        ours = predict_batch(dbn, np.eye(dbn.num_values)[kinds], np.full(len(kinds), a))
+        largest = max(largest, float(np.abs(ours - predict(kinds, a)).max()))
+    return largest
 
 
 def max_difference(dbn: TwoSliceDBN, model: Conditionals) -> float:

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nesy.dbn import inference
+from nesy.dbn.factored import FactoredUpdates
 from nesy.dbn.kernels import packed, sample_codes
 from nesy.errors import UserError
 from tests.nesy.dbn.models import all_codes, joint, marginals_of, random_dbn, transition_matrix
@@ -136,3 +137,32 @@ def test_wrong_arguments_are_named():
         dbn.predict(np.ones((3, 3)) / 3, 2)
     with pytest.raises(UserError, match="values"):
         dbn.log_prob(np.array([0, 0, 3]), 0, np.array([0, 0, 0]))
+
+
+@settings(max_examples=30, deadline=None)
+@given(seeds)
+def test_batched_prediction_is_the_exact_one(seed):
+    rng = np.random.default_rng(seed)
+    dbn = random_dbn(rng, num_factors=4, max_parents=3, zeros=seed % 2 == 0)
+    beliefs = np.stack([random_belief(rng, dbn) for _ in range(6)])
+    actions = rng.integers(0, 2, size=6)
+    expected = [dbn.predict(belief, action) for belief, action in zip(beliefs, actions, strict=True)]
+    np.testing.assert_allclose(FactoredUpdates(dbn).predict(beliefs, actions), expected, atol=1e-12)
+
+
+def test_batched_filter_agrees_with_the_exact_one_on_independent_factors_and_has_the_same_fallback():
+    rng = np.random.default_rng(4)
+    dbn = random_dbn(rng, arcs=False, zeros=True, concentration=0.2)
+    codes = all_codes(dbn)
+    beliefs, actions = np.eye(3)[codes], rng.integers(0, 2, size=len(codes))
+    likelihoods = rng.random(beliefs.shape)
+    filtered = FactoredUpdates(dbn).filter(beliefs, actions, likelihoods)
+    expected = [dbn.filter(b, a, o) for b, a, o in zip(beliefs, actions, likelihoods, strict=True)]
+    np.testing.assert_allclose(filtered, expected, atol=1e-12)
+    predicted = FactoredUpdates(dbn).predict(beliefs, actions)
+    b, i, k = np.argwhere(predicted == 0)[0]
+    likelihoods[b, i] = np.eye(3)[k]
+    likelihoods[b, (i + 1) % 3] = 0
+    fallen = FactoredUpdates(dbn).filter(beliefs, actions, likelihoods)
+    np.testing.assert_allclose(fallen[b, i], np.eye(3)[k])
+    np.testing.assert_allclose(fallen[b, (i + 1) % 3], predicted[b, (i + 1) % 3])

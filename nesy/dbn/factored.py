@@ -1,0 +1,366 @@
+"""Compiled, batched belief updates: exact one-step marginals for many beliefs at once.
+
+Variable elimination is planned once per action (which sums, in which order, over which flat arrays) and then run
+by one compiled kernel for every belief. Sums run over the support of the factors now, so certain beliefs cost
+next to nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from nesy.dbn.inference import ancestors
+from nesy.dbn.model import TwoSliceDBN
+from nesy.errors import UserError
+
+MAX_WORKSPACE = 1 << 24
+
+
+@dataclass(frozen=True)
+class _Tensor:
+    """A table in one of the kernel's two memories."""
+
+    scope: tuple[int, ...]
+    shared: bool
+    """In the model's tables rather than in the memory of one belief."""
+    offset: int
+    strides: tuple[int, ...]
+
+
+class Programs(NamedTuple):
+    """The planned sums of all actions; a named tuple, so numba takes it as an argument.
+
+    An operation sums a product of tables over some variables: `acc[k] += prod_j table_j[..., k]`. Its variables
+    are ordered: those of the result first (`num_outer`), then those summed out; `k` is the inner variable.
+    """
+
+    first: np.ndarray
+    """int64 [A + 1]: first operation of each action."""
+    num_outer: np.ndarray
+    """int64 [O]."""
+    num_loops: np.ndarray
+    """int64 [O]: outer and summed variables."""
+    variables: np.ndarray
+    """int64 [O, V]."""
+    num_inputs: np.ndarray
+    """int64 [O]."""
+    shared: np.ndarray
+    """bool [O, I]."""
+    base: np.ndarray
+    """int64 [O, I]."""
+    strides: np.ndarray
+    """int64 [O, I, V]."""
+    inner: np.ndarray
+    """int64 [O, I]: stride of the inner variable; 0 where the table does not have it."""
+    out_base: np.ndarray
+    """int64 [O]."""
+    out_strides: np.ndarray
+    """int64 [O, V]."""
+    memory: int
+    """Entries of one belief's memory: belief [N, K], result [N, K], intermediate tables."""
+
+
+class _Planner:
+    """Plans the sums of one model."""
+
+    def __init__(self, dbn: TwoSliceDBN) -> None:
+        self.dbn = dbn
+        self.operations: list[tuple[tuple[int, ...], tuple[int, ...], list[_Tensor], _Tensor]] = []
+        self.memory = 2 * dbn.num_factors * dbn.num_values
+
+    def plan(self, action: int, factor: int) -> None:
+        """Marginal of one next factor under one action."""
+        dbn, n, k = self.dbn, self.dbn.num_factors, self.dbn.num_values
+        pool, now = [], set()
+        for i in ancestors(dbn, action, (factor,)):
+            scope = tuple(where * n + p for where, p in dbn.parents(action, i)) + (n + i,)
+            strides = tuple(k ** (len(scope) - 1 - axis) for axis in range(len(scope)))
+            pool.append(_Tensor(scope, True, int(dbn.offsets[action, i]) * k, strides))
+            now |= set(dbn.parents_now[action][i])
+        pool += [_Tensor((p,), False, p * k, (1,)) for p in sorted(now)]
+        target = n + factor
+        waiting = {v for tensor in pool for v in tensor.scope} - {target}
+        while waiting:
+            variable = min(waiting, key=lambda v: (len(_scope(pool, v)), v))
+            chosen = [tensor for tensor in pool if variable in tensor.scope]
+            pool = [tensor for tensor in pool if variable not in tensor.scope]
+            elsewhere = {v for tensor in pool for v in tensor.scope} | {target}
+            scope = {v for tensor in chosen for v in tensor.scope}
+            # whatever occurs nowhere else is summed out in the same loop
+            result = tuple(sorted(scope & elsewhere))
+            waiting -= scope - set(result)
+            pool.append(self._sum(chosen, result, tuple(sorted(scope - set(result)))))
+        out = _Tensor((target,), False, (n + factor) * k, (1,))
+        self.operations.append(((target,), (), pool, out))
+
+    def _sum(self, chosen: list[_Tensor], result: tuple[int, ...], summed: tuple[int, ...]) -> _Tensor:
+        k = self.dbn.num_values
+        strides = tuple(k ** (len(result) - 1 - axis) for axis in range(len(result)))
+        out = _Tensor(result, False, self.memory, strides)
+        self.memory += k ** len(result)
+        if self.memory > MAX_WORKSPACE:
+            raise UserError("this model is too densely connected for exact marginals; sample instead")
+        self.operations.append((result, summed, chosen, out))
+        return out
+
+
+def _scope(pool: list[_Tensor], variable: int) -> set[int]:
+    return {v for tensor in pool if variable in tensor.scope for v in tensor.scope}
+
+
+def plan_updates(dbn: TwoSliceDBN) -> Programs:
+    """Plan the marginals of every factor under every action.
+
+    Raises:
+        UserError: the model is too densely connected.
+    """
+    planner = _Planner(dbn)
+    first = [0]
+    for a in range(dbn.num_actions):
+        for i in range(dbn.num_factors):
+            planner.plan(a, i)
+        first.append(len(planner.operations))
+    operations = planner.operations
+    loops = [_loops(result, summed, dbn.num_factors) for result, summed, _, _ in operations]
+    inputs = max(len(tensors) for _, _, tensors, _ in operations)
+    width = max(1, max(len(outer) + len(summed) for outer, summed, _ in loops))
+    number = len(operations)
+    programs = Programs(
+        first=np.array(first, dtype=np.int64),
+        num_outer=np.array([len(outer) for outer, _, _ in loops], dtype=np.int64),
+        num_loops=np.array([len(outer) + len(summed) for outer, summed, _ in loops], dtype=np.int64),
+        variables=np.zeros((number, width), dtype=np.int64),
+        num_inputs=np.array([len(tensors) for _, _, tensors, _ in operations], dtype=np.int64),
+        shared=np.zeros((number, inputs), dtype=np.bool_),
+        base=np.zeros((number, inputs), dtype=np.int64),
+        strides=np.zeros((number, inputs, width), dtype=np.int64),
+        inner=np.zeros((number, inputs), dtype=np.int64),
+        out_base=np.array([out.offset for _, _, _, out in operations], dtype=np.int64),
+        out_strides=np.zeros((number, width), dtype=np.int64),
+        memory=planner.memory,
+    )
+    for o, ((_, _, tensors, out), (outer, summed, inner)) in enumerate(zip(operations, loops, strict=True)):
+        variables = outer + summed
+        programs.variables[o, : len(variables)] = variables
+        programs.out_strides[o, : len(outer)] = [_stride(out, v) for v in outer]
+        for j, tensor in enumerate(tensors):
+            programs.shared[o, j] = tensor.shared
+            programs.base[o, j] = tensor.offset
+            programs.strides[o, j, : len(variables)] = [_stride(tensor, v) for v in variables]
+            programs.inner[o, j] = _stride(tensor, inner)
+    return programs
+
+
+def _loops(
+    result: tuple[int, ...], summed: tuple[int, ...], num_factors: int
+) -> tuple[tuple[int, ...], tuple[int, ...], int]:
+    """Outer, summed and inner variables: the inner one is the result's last factor of slice t+1.
+
+    Every result has one: an elimination that left none would have to be cut off from the target.
+    """
+    inner = max(v for v in result if v >= num_factors)
+    return tuple(v for v in result if v != inner), summed, inner
+
+
+def _stride(tensor: _Tensor, variable: int) -> int:
+    return tensor.strides[tensor.scope.index(variable)] if variable in tensor.scope else 0
+
+
+@njit(cache=True)
+def _sum_products(
+    programs: Programs,
+    o: int,
+    tables: np.ndarray,
+    memory: np.ndarray,
+    support: np.ndarray,
+    sizes: np.ndarray,
+    digits: np.ndarray,
+    offsets: np.ndarray,
+    accumulator: np.ndarray,
+    product: np.ndarray,
+) -> None:
+    """One operation: for every combination of the outer variables, the sum over the summed ones."""
+    num_values = accumulator.shape[0]
+    outer, loops, inputs = programs.num_outer[o], programs.num_loops[o], programs.num_inputs[o]
+    digits[:loops] = 0
+    while True:
+        target = programs.out_base[o]
+        for position in range(outer):
+            value = support[programs.variables[o, position], digits[position]]
+            target += programs.out_strides[o, position] * value
+        for j in range(inputs):
+            offsets[j] = programs.base[o, j]
+            for position in range(loops):
+                value = support[programs.variables[o, position], digits[position]]
+                offsets[j] += programs.strides[o, j, position] * value
+        accumulator[:] = 0.0
+        while True:
+            weight = 1.0
+            for j in range(inputs):
+                if programs.inner[o, j] == 0:
+                    weight *= tables[offsets[j]] if programs.shared[o, j] else memory[offsets[j]]
+            if weight != 0.0:
+                product[:] = weight
+                for j in range(inputs):
+                    stride, start = programs.inner[o, j], offsets[j]
+                    if stride != 0:
+                        source = tables if programs.shared[o, j] else memory
+                        for k in range(num_values):
+                            product[k] *= source[start + k * stride]
+                for k in range(num_values):
+                    accumulator[k] += product[k]
+            position = loops - 1
+            while position >= outer:
+                variable = programs.variables[o, position]
+                before = support[variable, digits[position]]
+                digits[position] = digits[position] + 1 if digits[position] + 1 < sizes[variable] else 0
+                step = support[variable, digits[position]] - before
+                for j in range(inputs):
+                    offsets[j] += programs.strides[o, j, position] * step
+                if digits[position] != 0:
+                    break
+                position -= 1
+            if position < outer:
+                break
+        for k in range(num_values):
+            memory[target + k] = accumulator[k]
+        position = outer - 1
+        while position >= 0:
+            variable = programs.variables[o, position]
+            digits[position] = digits[position] + 1 if digits[position] + 1 < sizes[variable] else 0
+            if digits[position] != 0:
+                break
+            position -= 1
+        if position < 0:
+            return
+
+
+@njit(cache=True)
+def _run(programs: Programs, tables: np.ndarray, beliefs: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    number, n, num_values = beliefs.shape
+    result = np.empty((number, n, num_values))
+    memory = np.empty(programs.memory)
+    support = np.empty((2 * n, num_values), dtype=np.int64)
+    sizes = np.full(2 * n, num_values, dtype=np.int64)
+    for v in range(n, 2 * n):
+        for k in range(num_values):
+            support[v, k] = k
+    digits = np.zeros(programs.variables.shape[1], dtype=np.int64)
+    offsets = np.zeros(programs.base.shape[1], dtype=np.int64)
+    accumulator, product = np.empty(num_values), np.empty(num_values)
+    for b in range(number):
+        for i in range(n):
+            sizes[i] = 0
+            for k in range(num_values):
+                memory[i * num_values + k] = beliefs[b, i, k]
+                if beliefs[b, i, k] > 0.0:
+                    support[i, sizes[i]] = k
+                    sizes[i] += 1
+        for o in range(programs.first[actions[b]], programs.first[actions[b] + 1]):
+            _sum_products(programs, o, tables, memory, support, sizes, digits, offsets, accumulator, product)
+        for i in range(n):
+            start = (n + i) * num_values
+            total = 0.0
+            for k in range(num_values):
+                total += memory[start + k]
+            for k in range(num_values):
+                result[b, i, k] = memory[start + k] / total
+    return result
+
+
+class FactoredUpdates:
+    """Belief updates of one model, planned once."""
+
+    def __init__(self, dbn: TwoSliceDBN) -> None:
+        """Plan the updates.
+
+        Raises:
+            UserError: the model is too densely connected.
+        """
+        self.shape = (dbn.num_factors, dbn.num_values)
+        self.num_actions = dbn.num_actions
+        self._programs = plan_updates(dbn)
+        self._tables = np.array(dbn.probabilities).reshape(-1)
+
+    def predict(self, beliefs: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """Exact marginals of the next factors for many beliefs, each a product of its rows.
+
+        Args:
+            beliefs: float [B, N, K], rows sum to 1.
+            actions: integers [B].
+
+        Returns:
+            float64 [B, N, K], rows sum to 1.
+
+        Raises:
+            UserError: wrong shapes, a row without any probability, or no such action.
+        """
+        beliefs = np.ascontiguousarray(beliefs, dtype=np.float64)
+        actions = np.ascontiguousarray(actions, dtype=np.int64)
+        if beliefs.shape[1:] != self.shape or actions.shape != beliefs.shape[:1]:
+            raise UserError(
+                f"beliefs have the shape [B, {self.shape[0]}, {self.shape[1]}] and actions [B], "
+                f"found {list(beliefs.shape)} and {list(actions.shape)}"
+            )
+        if not len(beliefs):
+            return beliefs
+        if actions.min() < 0 or actions.max() >= self.num_actions:
+            raise UserError(f"an action lies in 0..{self.num_actions - 1}")
+        if not (beliefs.min() >= 0 and beliefs.sum(axis=2).min() > 0):
+            raise UserError("each row of a belief needs numbers >= 0, not all of them 0")
+        return np.asarray(_run(self._programs, self._tables, beliefs, actions))
+
+    def filter(self, beliefs: np.ndarray, actions: np.ndarray, likelihoods: np.ndarray) -> np.ndarray:
+        """Factored filter: exact prediction, projection to its marginals, then Bayes' rule factor by factor.
+
+        The factored frontier of Murphy and Weiss (2001). It agrees with `TwoSliceDBN.filter` where the next
+        factors are independent under the belief; where an observation of one factor tells about another
+        through a shared parent, only the exact filter sees that. Fallback for an observation that the
+        prediction holds impossible: the observation, where it says something, else the prediction.
+
+        Args:
+            beliefs: float [B, N, K], rows sum to 1.
+            actions: integers [B].
+            likelihoods: float [B, N, K] >= 0.
+
+        Returns:
+            float64 [B, N, K], rows sum to 1.
+
+        Raises:
+            UserError: as `predict`, or negative likelihoods.
+        """
+        predicted = self.predict(beliefs, actions)
+        likelihoods = np.asarray(likelihoods, dtype=np.float64)
+        if likelihoods.shape != predicted.shape or (likelihoods.size and not likelihoods.min() >= 0):
+            raise UserError(f"likelihoods have the shape {list(predicted.shape)} and no negative entries")
+        return np.asarray(_weigh(predicted, np.ascontiguousarray(likelihoods)))
+
+
+@njit(cache=True)
+def _weigh(predicted: np.ndarray, likelihoods: np.ndarray) -> np.ndarray:
+    number, n, num_values = predicted.shape
+    result = np.empty(predicted.shape)
+    for b in range(number):
+        for i in range(n):
+            total, observed = 0.0, 0.0
+            for k in range(num_values):
+                result[b, i, k] = predicted[b, i, k] * likelihoods[b, i, k]
+                total += result[b, i, k]
+                observed += likelihoods[b, i, k]
+            for k in range(num_values):
+                if total > 0.0:
+                    result[b, i, k] /= total
+                elif observed > 0.0:
+                    result[b, i, k] = likelihoods[b, i, k] / observed
+                else:
+                    result[b, i, k] = predicted[b, i, k]
+    return result
+
+
+def predict_batch(dbn: TwoSliceDBN, beliefs: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """Exact next marginals of many beliefs (see `FactoredUpdates.predict`); the plan is made anew each call."""
+    return FactoredUpdates(dbn).predict(beliefs, actions)

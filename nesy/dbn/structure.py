@@ -1,0 +1,132 @@
+"""Who depends on whom, from transitions: a score-based search for the parents of every factor and action.
+
+Scores of a parent set with q rows, counts N_jk of row j and value k, N_j = sum_k N_jk:
+
+    BDeu  sum_j [ G(s/q) - G(s/q + N_j) + sum_k G(s/qK + N_jk) - G(s/qK) ],  G = log Gamma
+          (Heckerman, Geiger and Chickering 1995; s is the equivalent sample size)
+    BIC   log-likelihood - (log N) / 2 * q (K - 1)
+    AIC   log-likelihood - q (K - 1)
+
+Counts may be fractions: the children are distributions, so that a network's conditionals can be scored too.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from nesy.errors import UserError
+
+Score = Literal["bdeu", "bic", "aic"]
+SCORES: tuple[Score, ...] = ("bdeu", "bic", "aic")
+
+
+@dataclass(frozen=True)
+class Search:
+    """How parents are searched for."""
+
+    score: Score = "bdeu"
+    """What a parent set is judged by."""
+    sample_size: float = 1.0
+    """Equivalent sample size of BDeu."""
+    max_parents: int = 4
+    """Most parents from slice t."""
+    max_next: int = 0
+    """Most parents from slice t+1."""
+    exhaustive: int = 2
+    """Parent sets from slice t up to this size are all tried; larger ones grow parent by parent."""
+
+
+def learn_parents(
+    candidates: np.ndarray,
+    child: np.ndarray,
+    weights: np.ndarray,
+    num_values: int,
+    limits: Sequence[int],
+    search: Search,
+) -> tuple[int, ...]:
+    """The best parents of one factor under one action.
+
+    Args:
+        candidates: integers [n, C]: values of the possible parents.
+        child: float [n, K]: distribution of the child in every transition (one-hot where it was observed).
+        weights: float [n]: how much each transition counts.
+        num_values: K.
+        limits: (S, C): the first S candidates belong to slice t, the others to slice t+1.
+        search: what is searched.
+
+    Returns:
+        Columns of `candidates`, ascending.
+
+    Raises:
+        UserError: there is no such score.
+    """
+    if search.score not in SCORES:
+        raise UserError(f"no score '{search.score}'; the scores are {', '.join(SCORES)}")
+    split, total = limits
+    known: dict[tuple[int, ...], float] = {}
+    # equal combinations of candidates are merged once, so that every score works on few rows
+    merged, index = np.unique(candidates, axis=0, return_inverse=True)
+    index = index.reshape(-1)
+    counts = np.stack(
+        [np.bincount(index, weights * child[:, k], minlength=len(merged)) for k in range(num_values)], axis=1
+    )
+
+    def allowed(chosen: tuple[int, ...]) -> bool:
+        later = sum(c >= split for c in chosen)
+        return later <= search.max_next and len(chosen) - later <= search.max_parents
+
+    def score(chosen: tuple[int, ...]) -> float:
+        if chosen not in known:
+            known[chosen] = _score(merged[:, list(chosen)], counts, num_values, search)
+        return known[chosen]
+
+    depth = min(search.exhaustive, search.max_parents)
+    best = max((c for size in range(depth + 1) for c in itertools.combinations(range(split), size)), key=score)
+    return _climb(best, range(total), allowed, score)
+
+
+def _climb(
+    best: tuple[int, ...],
+    candidates: range,
+    allowed: Callable[[tuple[int, ...]], bool],
+    score: Callable[[tuple[int, ...]], float],
+) -> tuple[int, ...]:
+    """Add, drop or exchange one parent as long as the score rises."""
+    while True:
+        chosen = set(best)
+        moves = [tuple(sorted(chosen | {c})) for c in candidates if c not in chosen]
+        moves += [tuple(sorted(chosen - {c})) for c in best]
+        moves += [tuple(sorted(chosen - {c} | {d})) for c in best for d in candidates if d not in chosen]
+        moves = [move for move in moves if allowed(move)]
+        better = max(moves, key=score, default=best)
+        if score(better) <= score(best) + 1e-9:
+            return best
+        best = better
+
+
+def _score(values: np.ndarray, counts: np.ndarray, num_values: int, search: Search) -> float:
+    from scipy.special import gammaln
+
+    arity = values.shape[1]
+    q = float(num_values) ** arity
+    row = np.zeros(len(values), dtype=np.int64)
+    for column in range(arity):
+        row = row * num_values + values[:, column]
+    _, index = np.unique(row, return_inverse=True)
+    index = index.reshape(-1)
+    table = np.stack([np.bincount(index, counts[:, k]) for k in range(num_values)], axis=1)
+    totals = table.sum(axis=1)
+    if search.score == "bdeu":
+        per_row, per_entry = search.sample_size / q, search.sample_size / (q * num_values)
+        rows = gammaln(per_row) - gammaln(per_row + totals)
+        entries = gammaln(per_entry + table) - gammaln(per_entry)
+        return float(rows.sum() + entries.sum())
+    with np.errstate(divide="ignore", invalid="ignore"):
+        likelihood = float(np.where(table > 0, table * np.log(table / totals[:, None]), 0.0).sum())
+    free = q * (num_values - 1)
+    return likelihood - (0.5 * np.log(max(totals.sum(), 2.0)) if search.score == "bic" else 1.0) * free

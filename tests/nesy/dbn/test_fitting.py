@@ -1,0 +1,153 @@
+"""Structure and rows recovered from transitions."""
+
+import numpy as np
+import pytest
+
+from nesy.dbn.extraction import extract
+from nesy.dbn.fitting import from_callable, from_experience
+from nesy.dbn.measures import fidelity
+from nesy.dbn.structure import Search
+from nesy.errors import UserError
+from tests.nesy.dbn.models import random_dbn
+from tests.nesy.dbn.toy import Network, experience, toy
+
+
+def synthetic(rng, factors=8, values=8, parents=2, actions=1, concentration=0.3):
+    """A model in which every factor has exactly `parents` parents."""
+    from nesy.dbn.model import TwoSliceDBN
+
+    now = [
+        [sorted(rng.choice(factors, parents, replace=False).tolist()) for _ in range(factors)] for _ in range(actions)
+    ]
+    tables = [
+        [rng.dirichlet(np.full(values, concentration), size=values**parents) for _ in range(factors)]
+        for _ in range(actions)
+    ]
+    return TwoSliceDBN.from_tables(tables, now)
+
+
+def transitions(dbn, rng, number):
+    codes = rng.integers(0, dbn.num_values, size=(number, dbn.num_factors)).astype(np.uint8)
+    actions = rng.integers(0, dbn.num_actions, size=number)
+    return codes, actions, dbn.sample(codes, actions, rng)
+
+
+def recovered(truth, found):
+    """True arcs found, arcs found, true arcs."""
+    pairs = [
+        (set(truth.parents(a, i)), set(found.parents(a, i)))
+        for a in range(truth.num_actions)
+        for i in range(truth.num_factors)
+    ]
+    return (
+        sum(len(t & f) for t, f in pairs),
+        sum(len(f) for _, f in pairs),
+        sum(len(t) for t, _ in pairs),
+    )
+
+
+def test_structure_of_synthetic_models_is_recovered():
+    right = found = true = 0
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        dbn = synthetic(rng)
+        learned = from_experience(*transitions(dbn, rng, 20_000), num_values=8, search=Search(max_next=1))
+        r, f, t = recovered(dbn, learned)
+        right, found, true = right + r, found + f, true + t
+    assert right / found >= 0.98 and right / true >= 0.98
+
+
+def test_rows_come_close_to_the_true_ones_and_rows_never_met_are_marked():
+    rng = np.random.default_rng(0)
+    dbn = synthetic(rng, factors=3, values=3, parents=1)
+    codes, actions, later = transitions(dbn, rng, 20_000)
+    met = codes[:, 0] != 2
+    learned = from_experience(codes[met], actions[met], later[met], num_values=3)
+    for i in range(3):
+        if learned.parents_now[0][i] == dbn.parents_now[0][i] == (0,):
+            assert learned.counts(0, i)[2] == 0
+            np.testing.assert_allclose(learned.cpt(0, i)[:2], dbn.cpt(0, i)[:2], atol=0.03)
+    assert int(learned.counts(0, 0).sum()) == met.sum()
+
+
+def test_arcs_within_the_next_slice_are_found():
+    rng = np.random.default_rng(1)
+    codes = rng.integers(0, 4, size=(5000, 2)).astype(np.uint8)
+    coin = rng.integers(0, 4, size=5000).astype(np.uint8)
+    later = np.column_stack([coin, coin])
+    learned = from_experience(codes, np.zeros(5000, dtype=int), later, num_values=4)
+    assert learned.parents(0, 1) == ((1, 0),) and learned.parents(0, 0) == ()
+
+
+def test_parents_of_a_network_given_as_a_callable():
+    rng = np.random.default_rng(2)
+    dbn = synthetic(rng, factors=4, values=4, parents=2, actions=2)
+
+    def predict(codes, action):
+        return np.stack([dbn.cpt(action, i)[dbn.rows(action, i, codes.astype(int), codes)] for i in range(4)], axis=1)
+
+    codes, actions, later = transitions(dbn, rng, 20_000)
+    learned = from_callable(predict, codes, actions, later, num_values=4, action_names=("x", "y"))
+    assert learned.parents_now == dbn.parents_now
+    np.testing.assert_allclose(learned.probabilities, dbn.probabilities, atol=1e-4)
+    figures = fidelity(learned, predict, _Transitions(codes, actions, later))
+    assert figures["max_difference_to_network"] < 1e-4
+
+
+class _Transitions:
+    def __init__(self, codes, actions, later):
+        self.codes, self.actions, self.next_codes = codes, actions, later
+        self.view_codes = np.unique(codes, axis=0)
+        self.views = np.zeros((len(self.view_codes), 1, 1), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("score", ["bic", "aic"])
+def test_other_scores_work_and_unknown_ones_are_refused(score):
+    rng = np.random.default_rng(3)
+    dbn = synthetic(rng, factors=3, values=3, parents=1)
+    taken = transitions(dbn, rng, 5000)
+    learned = from_experience(*taken, num_values=3, search=Search(score=score))
+    right, _, true = recovered(dbn, learned)
+    assert right == true
+    with pytest.raises(UserError, match="bdeu"):
+        from_experience(*taken, num_values=3, search=Search(score="best"))
+
+
+def test_nothing_to_count_from_is_an_error():
+    nothing = np.zeros((0, 3), dtype=np.uint8)
+    with pytest.raises(UserError, match="at least one transition"):
+        from_experience(nothing, nothing[:, 0], nothing, num_values=3)
+
+
+def test_extraction_by_enumeration_is_exact_and_counts_what_was_met():
+    dbn, _ = toy()
+    for action in range(2):
+        for factor in range(3):
+            np.testing.assert_array_equal(dbn.cpt(action, factor), Network().conditional(action, factor))
+    # (side, front) = (1, 0): views 2 and 6
+    assert dbn.counts(1, 1)[3] == 2
+    assert dbn.counts(1, 1)[8] == 0
+    figures = fidelity(dbn, Network(), experience())
+    assert figures["max_difference_to_network"] == 0
+    assert figures["nll"] == 0 and figures["nll_limit"] == 0 and figures["impossible"] == 0
+    assert figures["rows"] == 9 + 9 + 9 or figures["rows"] == len(dbn.probabilities)
+
+
+def test_the_limit_is_the_conditional_entropy():
+    rng = np.random.default_rng(4)
+    dbn = random_dbn(rng, num_actions=1)
+    codes = np.zeros((4, 3), dtype=np.uint8)
+    later = np.array([[0, 0, 0], [0, 0, 0], [1, 0, 0], [2, 0, 0]], dtype=np.uint8)
+    figures = fidelity(dbn, None, _Transitions(codes, np.zeros(4, dtype=int), later))
+    assert figures["nll_limit"] == pytest.approx(1.5 * np.log(2))
+    assert figures["nll"] >= figures["nll_limit"]
+    assert figures["nll"] == pytest.approx(-dbn.log_prob(codes, 0, later).mean())
+
+
+def test_extract_needs_initial_codes_that_exist():
+    with pytest.raises(UserError):
+        extract(
+            Network(),
+            *(np.zeros((1, 3), dtype=np.uint8), np.zeros(1, dtype=int), np.zeros((1, 3), dtype=np.uint8)),
+            initial_codes=np.zeros((0, 3), dtype=np.uint8),
+        )
