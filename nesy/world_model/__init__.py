@@ -1,0 +1,19 @@
+"""The world model: views to codes, codes to next codes, and back."""
+
+from nesy.world_model.codec import SymbolicCodec
+from nesy.world_model.networks import SymbolicWorldModel, WorldModel
+from nesy.world_model.paper import PaperWorldModel
+from nesy.world_model.storage import load_world_model, save_world_model
+from nesy.world_model.structure import Structure
+from nesy.world_model.training import train
+
+__all__ = [
+    "PaperWorldModel",
+    "Structure",
+    "SymbolicCodec",
+    "SymbolicWorldModel",
+    "WorldModel",
+    "load_world_model",
+    "save_world_model",
+    "train",
+]

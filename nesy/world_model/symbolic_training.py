@@ -1,0 +1,366 @@
+"""Training of the `symbolic` architecture, in three stages.
+
+1. `network`: encoder, decoder, inverse model and an autoregressive forward guide are trained together on
+   `L = L_VAE + L_forward + L_inverse` with straight-through Gumbel samples of a falling temperature, less a
+   bonus for using all values.
+2. `codes` (where the distinct views are few): the codes are made distinct and refined by coordinate descent on
+   the likelihood of the 2DBN whose tables are counted from them; how sure the encoder was enters as a cost.
+3. `fit`: encoder, decoder and inverse model learn the refined code book, until every view is encoded to its code
+   and rebuilt exactly. The tables are then counted from the encoder's own codes.
+
+Where views are many, stage 2 is left out and stage 3 goes on as stage 1 without noise.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from nesy.config import TrainConfig
+from nesy.world_model import losses
+from nesy.world_model.codec import SymbolicCodec
+from nesy.world_model.distinct import Transitions, view_keys
+from nesy.world_model.gates import limits, next_gates, view_gates
+from nesy.world_model.networks import SymbolicWorldModel, perceptron
+from nesy.world_model.refinement import CodeBook, Refiner, separate
+from nesy.world_model.structure import Limits, Structure
+
+REFINE_UP_TO = 5000
+"""Most distinct views for which codes are refined one by one."""
+MOST_STEPS = 200
+"""Mini-batches in one epoch at most."""
+LEARNING_SCALE = 0.3
+"""Share of the configured step size that suits plain perceptrons."""
+USAGE_WEIGHT, FORWARD_WEIGHT, INVERSE_WEIGHT = 0.02, 0.1, 0.1
+RELUCTANCE = 0.1
+"""Nats of cost per nat of the encoder's disbelief."""
+NOISE = 3.0
+"""Annealing temperature of the refinement at its start, in nats."""
+SWEEPS = 2
+"""Passes over the code book per round of refinement."""
+
+
+class ForwardGuide(nn.Module):
+    """Predicts the next code factor by factor, later factors seeing the earlier ones; only used in training."""
+
+    def __init__(self, model: SymbolicWorldModel) -> None:
+        super().__init__()
+        self.sizes = (model.num_factors, model.num_values, model.num_actions)
+        code = model.num_factors * model.num_values
+        self.context = perceptron(code + model.num_actions, model.hidden, code)
+        self.earlier = nn.Linear(code, code, bias=False)
+        factor = torch.arange(code) // model.num_values
+        self.register_buffer("mask", (factor[:, None] > factor[None, :]).float())
+
+    def forward(self, belief: Tensor, action: Tensor, then: Tensor) -> Tensor:
+        """Logits [B, N, K] of the next code, given what really followed in earlier factors, `then` [B, N, K]."""
+        num_factors, num_values, num_actions = self.sizes
+        inputs = torch.cat([belief.flatten(1), F.one_hot(action.long(), num_actions).float()], 1)
+        logits = self.context(inputs) + F.linear(then.flatten(1), self.earlier.weight * self.mask)
+        shaped: Tensor = logits.view(-1, num_factors, num_values)
+        return shaped
+
+
+class SymbolicTrainer:
+    """One training run; `tick` does one epoch or one round, and all state goes through `state` and `restore`."""
+
+    stages = ("network", "codes", "fit")
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        seed: int,
+        everything: Transitions,
+        training: Transitions,
+        held_out: Transitions | None,
+    ) -> None:
+        self.config, self.everything, self.held_out = config, everything, held_out
+        self.refines = everything.num_views <= REFINE_UP_TO
+        self.training = training
+        self.final = everything if self.refines else training
+        self.device = torch.device(config.device)
+        self.generator = torch.Generator().manual_seed(seed)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.model = SymbolicWorldModel(view_size=everything.views.shape[1])
+            self.guide = ForwardGuide(self.model)
+        self.model.to(self.device)
+        self.guide.to(self.device)
+        self.weights = losses.class_weights(training.views, np.maximum(training.visits, 0)).to(self.device)
+        self.optimizer = self._optimizer(config.learning_rate * LEARNING_SCALE)
+        self.rng = np.random.default_rng(seed)
+        next_arcs = 1 if config.intra_slice_arcs else 0
+        bounds = Limits(now=config.max_parents, next=next_arcs, total=min(config.max_parents + next_arcs, 6))
+        self.refiner = Refiner(self.final, self.model.num_values, self.model.num_actions, bounds)
+        self.train_refiner = Refiner(training, self.model.num_values, self.model.num_actions, bounds)
+        self.rounds = max(4, round(config.epochs / 4)) if self.refines else 0
+        self.book: CodeBook | None = None
+        self.reluctance: np.ndarray | None = None
+        self.held_out_figures: dict[str, Any] = {}
+        self.stage, self.epoch, self.finished = "network", 0, False
+        self.views = torch.as_tensor(everything.views, device=self.device)
+
+    # ---------------------------------------------------------------- progress and time
+    def length(self) -> int:
+        """Most ticks that the run can take."""
+        return self.config.epochs * 2 + self.rounds
+
+    def deadline(self) -> float:
+        """Seconds of the time limit after which the present stage must end."""
+        if not self.config.time_limit:
+            return math.inf
+        share = {"network": 0.4 if self.refines else 0.7, "codes": 0.75, "fit": 0.97}[self.stage]
+        return share * self.config.time_limit
+
+    def tick(self, elapsed: float) -> dict[str, Any]:
+        """Do one epoch or round; `elapsed` is the time used so far, in seconds."""
+        stage = self.stage
+        figures = {"network": self._network_epoch, "codes": self._codes_round, "fit": self._fit_epoch}[stage]()
+        self.epoch += 1
+        last = {"network": self.config.epochs, "codes": self.rounds, "fit": self.config.epochs}[stage]
+        if self.epoch >= last or figures.pop("converged", False) or elapsed >= self.deadline():
+            self._end_stage()
+        return {"stage": stage, **figures}
+
+    def _end_stage(self) -> None:
+        if self.stage == "network":
+            self._measure_held_out()
+            if self.refines:
+                logits = self._logits()
+                codes = separate(logits)
+                self.reluctance = RELUCTANCE * (logits.max(2, keepdims=True) - logits).clip(max=30.0)
+                self.book = self.refiner.search(codes)
+        if self.stage == "fit":
+            self._set_forward_model(self.final)
+            if not self.refines:
+                self._measure_held_out()
+            self.finished = True
+            return
+        self.stage = self.stages[self.stages.index(self.stage) + 1]
+        if self.stage == "codes" and not self.refines:
+            self.stage = "fit"
+        self.epoch = 0
+        self.optimizer = self._optimizer(self.config.learning_rate * LEARNING_SCALE * (1.0 if self.refines else 0.3))
+
+    # ---------------------------------------------------------------- stage 1
+    def _network_epoch(self) -> dict[str, Any]:
+        done = self.epoch / self.config.epochs
+        noise = max(0.0, 1.0 - 1.3 * done)
+        temperature = max(0.4, 1.0 - done)
+        figures = self._autoencoder_epoch(noise, temperature, done)
+        return {**figures, "temperature": temperature, **self._view_figures()}
+
+    def _autoencoder_epoch(self, noise: float, temperature: float, done: float) -> dict[str, float]:
+        self._set_learning_rate(done)
+        t = self.training
+        order = torch.randperm(len(t), generator=self.generator)
+        steps = min(MOST_STEPS, max(1, len(t) // self.config.batch_size))
+        totals = {"loss": 0.0, "reconstruction": 0.0, "kl": 0.0, "forward": 0.0, "inverse": 0.0}
+        for rows in order[: steps * self.config.batch_size].chunk(steps):
+            parts = self._loss(rows.numpy(), noise, temperature)
+            self.optimizer.zero_grad(set_to_none=True)
+            parts["loss"].backward()  # type: ignore[no-untyped-call]
+            self.optimizer.step()
+            for name, value in parts.items():
+                totals[name] += float(value.detach()) / steps
+        return totals
+
+    def _loss(self, rows: np.ndarray, noise: float, temperature: float) -> dict[str, Tensor]:
+        t, model = self.training, self.model
+        action = torch.as_tensor(t.action[rows], device=self.device)
+        # Source and target views overlap much; each distinct view goes through the encoder once.
+        views, place = np.unique(np.concatenate([t.source[rows], t.target[rows]]), return_inverse=True)
+        source, target = torch.as_tensor(place, device=self.device).chunk(2)
+        batch = self.views[torch.as_tensor(views, device=self.device)]
+        logits = model.encode(batch)
+        sample, soft = losses.sample_straight_through(logits, temperature, noise, self.generator)
+        certain = model.one_hot(logits.argmax(-1))
+        before, then = sample[source], certain[target]
+        parts = {
+            "reconstruction": losses.reconstruction(model.decode(sample), batch, self.weights),
+            "kl": losses.kl_to_uniform(logits),
+            "forward": F.cross_entropy(self.guide(before, action, then).flatten(0, 1), then.argmax(-1).flatten())
+            * model.num_factors,
+            "inverse": F.cross_entropy(model.infer_action(before, sample[target]), action),
+        }
+        # The KL pulls towards the uniform prior; its weight fades with the noise, for codes are to be certain.
+        parts["loss"] = (
+            parts["reconstruction"]
+            + self.config.kl_weight * noise * 0.1 * parts["kl"]
+            + FORWARD_WEIGHT * parts["forward"]
+            + INVERSE_WEIGHT * parts["inverse"]
+            - USAGE_WEIGHT * losses.usage_entropy(soft)
+        )
+        return parts
+
+    # ---------------------------------------------------------------- stage 2
+    def _codes_round(self) -> dict[str, Any]:
+        assert self.book is not None and self.reluctance is not None
+        noise = NOISE * max(0.0, 1.0 - self.epoch / (0.7 * self.rounds))
+        self.book, moved = self.refiner.refine(self.book, self.reluctance, noise, SWEEPS, self.rng)
+        return {"next_code_nll": self.book.nll, "moved": moved, "noise": noise}
+
+    # ---------------------------------------------------------------- stage 3
+    def _fit_epoch(self) -> dict[str, Any]:
+        done = self.epoch / self.config.epochs
+        if self.book is None:
+            return {**self._autoencoder_epoch(0.0, 0.4, done), **self._view_figures()}
+        self._set_learning_rate(done)
+        t, model = self.final, self.model
+        codes = torch.as_tensor(self.book.codes, device=self.device)
+        steps = max(8, min(MOST_STEPS, t.num_views // self.config.batch_size))
+        size = min(t.num_views, max(self.config.batch_size, t.num_views // steps))
+        totals = {"loss": 0.0, "code": 0.0, "reconstruction": 0.0, "inverse": 0.0}
+        for _ in range(steps):
+            rows = torch.randperm(t.num_views, generator=self.generator)[:size].to(self.device)
+            edges = torch.randint(len(t), (size,), generator=self.generator).numpy()
+            before, after = (model.one_hot(codes[torch.as_tensor(ends[edges])]) for ends in (t.source, t.target))
+            action = torch.as_tensor(t.action[edges], device=self.device)
+            parts = {
+                "code": F.cross_entropy(model.encode(self.views[rows]).flatten(0, 1), codes[rows].flatten())
+                * model.num_factors,
+                "reconstruction": losses.reconstruction(model.decode(model.one_hot(codes[rows])), self.views[rows]),
+                "inverse": F.cross_entropy(model.infer_action(before, after), action),
+            }
+            parts["loss"] = parts["code"] + parts["reconstruction"] + parts["inverse"]
+            self.optimizer.zero_grad(set_to_none=True)
+            parts["loss"].backward()  # type: ignore[no-untyped-call]
+            self.optimizer.step()
+            for name, value in parts.items():
+                totals[name] += float(value.detach()) / steps
+        figures = self._view_figures()
+        with torch.no_grad():
+            agree = float((model.codes(self.views) == codes).all(1).float().mean())
+        settled = done >= 0.5 and agree == 1.0 and figures["views_exact"] == 1.0
+        return {**totals, "code_agreement": agree, **figures, "converged": settled}
+
+    # ---------------------------------------------------------------- shared
+    def _view_figures(self) -> dict[str, Any]:
+        # The gates of every epoch: on held-out maps where the stage leaves some out, on all views otherwise.
+        held_out = self.held_out is not None and (self.stage == "network" or not self.refines)
+        target = self.held_out if held_out and self.held_out is not None else self.final
+        figures = view_gates(SymbolicCodec(self.model), target.views)
+        self.model.train()
+        return {name: figures[name] for name in ("views_exact", "cells", "distinct_codes", "distinct_views")}
+
+    def _measure_held_out(self) -> None:
+        if self.held_out is None:
+            return
+        self._set_forward_model(self.training)
+        codec = SymbolicCodec(self.model)
+        new = ~np.isin(view_keys(self.held_out.views), view_keys(self.training.views[self.training.visits > 0]))
+        self.held_out_figures = {**view_gates(codec, self.held_out.views), **next_gates(codec, self.held_out)}
+        self.held_out_figures |= {"limits": limits(self.held_out), "new_views": int(new.sum())}
+        if new.any():
+            figures = view_gates(codec, self.held_out.views[new])
+            self.held_out_figures |= {f"new_{name}": figures[name] for name in ("views_exact", "cells")}
+        self.model.train()
+
+    def _set_forward_model(self, transitions: Transitions) -> None:
+        t = transitions
+        refiner = self.refiner if t is self.final else self.train_refiner
+        with torch.no_grad():
+            codes = self.model.codes(self.views).cpu().numpy().astype(np.int64)
+        start = self.book.structure if self.book is not None else None
+        book = refiner.search(codes, start)
+        self.model.set_transitions(book.structure, codes[t.source], t.action, codes[t.target], t.weight)
+
+    def _logits(self) -> np.ndarray:
+        with torch.no_grad():
+            return np.asarray(self.model.encode(self.views).cpu().numpy(), dtype=np.float64)
+
+    def _optimizer(self, rate: float) -> torch.optim.Adam:
+        modules = [*self.model.parameters(), *self.guide.parameters()]
+        return torch.optim.Adam(modules, lr=rate)
+
+    def _set_learning_rate(self, done: float) -> None:
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["initial_lr"] = group.get("initial_lr", group["lr"])
+            group["lr"] = group["initial_lr"] * (0.03 + 0.97 * 0.5 * (1 + math.cos(math.pi * done)))
+
+    # ---------------------------------------------------------------- state
+    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Everything that the next tick depends on: tensors, and a JSON value."""
+        tensors = {f"model.{name}": value for name, value in self.model.state_dict().items()}
+        tensors |= {f"guide.{name}": value for name, value in self.guide.state_dict().items()}
+        tensors |= optimizer_tensors(self.optimizer)
+        tensors["generator"] = self.generator.get_state()
+        value: dict[str, Any] = {
+            "stage": self.stage,
+            "epoch": self.epoch,
+            "finished": self.finished,
+            "rng": self.rng.bit_generator.state,
+            "rates": [[group["lr"], group.get("initial_lr", group["lr"])] for group in self.optimizer.param_groups],
+            "held_out": self.held_out_figures,
+        }
+        structure = self.model.settings().get("structure")
+        if structure is not None:
+            value["structure"] = structure
+        if self.book is not None and self.reluctance is not None:
+            tensors["codes"] = torch.as_tensor(self.book.codes)
+            tensors["reluctance"] = torch.as_tensor(self.reluctance)
+            found = self.book.structure
+            value["book"] = {
+                "nll": self.book.nll,
+                "parents_now": found.parents_now,
+                "parents_next": found.parents_next,
+                "order": found.order,
+            }
+        return tensors, value
+
+    def restore(self, tensors: dict[str, Tensor], value: dict[str, Any]) -> None:
+        """Continue from what `state` gave."""
+        weights = {name[6:]: tensor for name, tensor in tensors.items() if name.startswith("model.")}
+        for name in ("now", "action", "then", "weight"):
+            key = f"transitions_{name}"
+            setattr(self.model, key, torch.zeros_like(weights[key], device=self.device))
+        self.model.load_state_dict(weights)
+        self.guide.load_state_dict({n[6:]: tensor for n, tensor in tensors.items() if n.startswith("guide.")})
+        self.optimizer = self._optimizer(self.config.learning_rate)
+        restore_optimizer(self.optimizer, tensors)
+        for group, (rate, initial) in zip(self.optimizer.param_groups, value["rates"], strict=True):
+            group["lr"], group["initial_lr"] = rate, initial
+        self.generator.set_state(tensors["generator"])
+        self.rng.bit_generator.state = value["rng"]
+        self.stage, self.epoch, self.finished = value["stage"], value["epoch"], value["finished"]
+        self.held_out_figures = value["held_out"]
+        if "structure" in value:
+            self.model.set_structure(structure_of(value["structure"]))
+        if "book" in value:
+            self.book = CodeBook(tensors["codes"].numpy(), structure_of(value["book"]), value["book"]["nll"])
+            self.reluctance = tensors["reluctance"].numpy()
+
+
+def structure_of(value: dict[str, Any]) -> Structure:
+    """A structure from its JSON form."""
+
+    def parents(name: str) -> tuple[tuple[tuple[int, ...], ...], ...]:
+        return tuple(tuple(tuple(int(j) for j in family) for family in action) for action in value[name])
+
+    return Structure(parents("parents_now"), parents("parents_next"), tuple(int(i) for i in value["order"]))
+
+
+def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """Adam's moments and step counts by name."""
+    tensors = {}
+    for index, state in optimizer.state_dict()["state"].items():
+        for name, tensor in state.items():
+            tensors[f"optimizer.{index}.{name}"] = tensor
+    return tensors
+
+
+def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
+    """Put back what `optimizer_tensors` gave."""
+    state: dict[int, dict[str, Tensor]] = {}
+    for name, tensor in tensors.items():
+        if name.startswith("optimizer."):
+            _, index, part = name.split(".", 2)
+            state.setdefault(int(index), {})[part] = tensor
+    value = optimizer.state_dict()
+    value["state"] = state
+    optimizer.load_state_dict(value)

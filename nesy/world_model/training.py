@@ -1,0 +1,155 @@
+"""Training as a product: one loop for both architectures, with checkpoints, logs and the gates.
+
+After every epoch the whole state (weights, optimiser, generators, codes) is written atomically, so a training
+killed at any moment goes on at the last finished epoch and ends with the same weights, bit for bit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from nesy.config import TrainConfig
+from nesy.errors import UserError
+from nesy.experience import Experience
+from nesy.progress import SILENT, Progress
+from nesy.world_model.codec import SymbolicCodec
+from nesy.world_model.distinct import Transitions, transitions_of
+from nesy.world_model.gates import evaluate
+from nesy.world_model.logs import MetricsLog
+from nesy.world_model.paper_training import PaperTrainer
+from nesy.world_model.storage import load_tensors, save_tensors, save_world_model
+from nesy.world_model.symbolic_training import SymbolicTrainer
+
+CHECKPOINT = "checkpoint.safetensors"
+TRAINERS = {"symbolic": SymbolicTrainer, "paper": PaperTrainer}
+SHOWN = ("loss", "views_exact", "next_code_nll", "code_agreement")
+
+
+def train(
+    experience: Experience,
+    config: TrainConfig,
+    folder: Path | str,
+    seed: int = 0,
+    progress: Progress = SILENT,
+    *,
+    reference: Transitions | None = None,
+) -> dict[str, Any]:
+    """Train a world model, or go on where an interrupted training stopped.
+
+    Args:
+        experience: what to learn from.
+        config: how to learn.
+        folder: where model, checkpoint and logs go.
+        seed: of everything random.
+        progress: where to report.
+        reference: transitions to compute the gates on; those of all the experience by default.
+
+    Returns:
+        The gates on `reference` with the limits of its data (see `gates.evaluate`), `held_out` figures from
+        before any held-out map was learned from, `epochs`, `seconds`, `architecture`.
+
+    Raises:
+        UserError: impossible settings, or no experience.
+    """
+    folder = Path(folder)
+    _check(config, experience)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # small networks: one thread is as fast, and sums are in the same order everywhere
+    try:
+        return _train(experience, config, folder, seed, progress, reference)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _train(
+    experience: Experience,
+    config: TrainConfig,
+    folder: Path,
+    seed: int,
+    progress: Progress,
+    reference: Transitions | None,
+) -> dict[str, Any]:
+    everything = transitions_of(experience)
+    training, held_out = everything, None
+    if config.held_out > 0:
+        apart = experience.held_out_maps(config.held_out, np.random.default_rng(seed))
+        if apart.any() and not apart.all():
+            training = transitions_of(experience.select(~apart), base=everything)
+            held_out = transitions_of(experience.select(apart))
+    trainer = TRAINERS[config.architecture](config, seed, everything, training, held_out)
+    fingerprint = _fingerprint(config, seed, everything)
+    tick, elapsed = _resume(trainer, folder / CHECKPOINT, fingerprint)
+    with MetricsLog(folder, keep=tick) as log, progress.task("training the world model", trainer.length()) as bar:
+        bar.advance(tick)
+        started = time.monotonic() - elapsed
+        while not trainer.finished:
+            figures = trainer.tick(time.monotonic() - started)
+            tick += 1
+            elapsed = time.monotonic() - started
+            log.write(tick, {**figures, "seconds": round(elapsed, 3)})
+            tensors, state = trainer.state()
+            value = {"trainer": state, "tick": tick, "elapsed": elapsed, "fingerprint": fingerprint}
+            save_tensors(folder / CHECKPOINT, tensors, value)
+            shown = {name: figures[name] for name in SHOWN if name in figures}
+            bar.advance(1, **shown)
+    codec = SymbolicCodec(trainer.model)
+    metrics = {
+        **evaluate(codec, everything if reference is None else reference),
+        "held_out": trainer.held_out_figures,
+        "architecture": config.architecture,
+        "epochs": tick,
+        "seconds": round(elapsed, 2),
+    }
+    save_world_model(trainer.model, folder, metrics)
+    return metrics
+
+
+def _check(config: TrainConfig, experience: Experience) -> None:
+    if config.architecture not in TRAINERS:
+        raise UserError(f"unknown architecture '{config.architecture}'; known: {', '.join(TRAINERS)}")
+    if not len(experience):
+        raise UserError("no experience to train on; collect some with: nesy collect")
+    positive = {"epochs": config.epochs, "batch_size": config.batch_size, "learning_rate": config.learning_rate}
+    for name, value in positive.items():
+        if not value > 0:
+            raise UserError(f"training: {name} must be positive, not {value}")
+    if not 1 <= config.max_parents <= 5:
+        raise UserError(f"training: max_parents must be from 1 to 5, not {config.max_parents}")
+    if not 0 <= config.held_out < 1:
+        raise UserError(f"training: held_out must be in [0, 1), not {config.held_out}")
+    try:
+        torch.empty(1, device=config.device)
+    except (RuntimeError, AssertionError) as error:
+        raise UserError(f"--device {config.device}: not usable here ({str(error).splitlines()[0]})") from None
+
+
+def _fingerprint(config: TrainConfig, seed: int, transitions: Transitions) -> str:
+    """What a checkpoint must agree in to be gone on from; the time limit may change."""
+    settings = {**dataclasses.asdict(config), "time_limit": 0.0, "seed": seed}
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
+    for array in (transitions.views, transitions.source, transitions.action, transitions.target, transitions.weight):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _resume(trainer: SymbolicTrainer | PaperTrainer, path: Path, fingerprint: str) -> tuple[int, float]:
+    """Restore the checkpoint, if there is one of this very training; returns its tick and the seconds used."""
+    if not path.exists():
+        return 0, 0.0
+    tensors, value = load_tensors(path)
+    if value.get("fingerprint") != fingerprint:
+        return 0, 0.0
+    try:
+        trainer.restore(tensors, value["trainer"])
+        return int(value["tick"]), float(value["elapsed"])
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UserError(f"{path}: damaged checkpoint ({reason}); delete it to train anew") from None
