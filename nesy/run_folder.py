@@ -88,9 +88,7 @@ class RunFolder:
             raise UserError(f"{path}: no such run folder (make one with: nesy run --run {path})")
         run = cls(path)
         if not run.has("config"):
-            raise UserError(
-                f"{path}: not a run folder, config.json is missing (make one with: nesy run --run {path})"
-            )
+            raise UserError(f"{path}: not a run folder, config.json is missing (make one with: nesy run --run {path})")
         return run
 
     @property

@@ -54,7 +54,7 @@ def run(options: Arguments) -> dict[str, Any]:
         raise UserError(f"--record {options.record}: the ending must be .gif or .mp4")
     if options.agent == "keyboard" and not sys.stdin.isatty():
         raise UserError("--agent keyboard needs a terminal; name another driver, such as --agent follower")
-    parameters = {} if options.size is None else {"size": options.size}
+    parameters: dict[str, Any] = {} if options.size is None else {"size": options.size}
     env = gymnasium.make("nesy/PersonFollowing-v0", variant=options.variant, render_mode="rgb_array", **parameters)
     frames: list[np.ndarray] = []
     episodes = []
@@ -103,7 +103,7 @@ def _policy(env: Any, options: Arguments) -> Iterator[Callable[[], int | None]]:
 def _optimum(env: Any, options: Arguments) -> Callable[[], int]:
     from domains.core import load_domain
 
-    parameters = {} if options.size is None else {"size": options.size}
+    parameters: dict[str, Any] = {} if options.size is None else {"size": options.size}
     oracle = load_domain().optimum(options.variant, **parameters)
     return lambda: int(oracle.actions(env.unwrapped)[0])
 
