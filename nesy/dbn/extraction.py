@@ -12,7 +12,7 @@ import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -46,6 +46,7 @@ class Structure(Protocol):
         ...
 
 
+@runtime_checkable
 class Conditionals(Protocol):
     """A network that decides each next factor from few parents."""
 
@@ -165,8 +166,7 @@ def extract_run(run: RunFolder, domain_name: str) -> dict[str, Any]:
         },
     }
     taken = (transitions.codes, transitions.actions, transitions.next_codes)
-    exact = hasattr(model, "conditional")
-    if exact:
+    if isinstance(model, Conditionals):
         dbn = extract(model, *taken, **described)
     else:
         from nesy.dbn.fitting import from_callable
@@ -175,7 +175,9 @@ def extract_run(run: RunFolder, domain_name: str) -> dict[str, Any]:
     codebook.save(run.dbn)
     # last: the step counts as done when model.json is there
     dbn.save(run.dbn)
-    return fidelity(TwoSliceDBN.load(run.dbn), model if exact else network_marginals(codec), transitions)
+    return fidelity(
+        TwoSliceDBN.load(run.dbn), model if isinstance(model, Conditionals) else network_marginals(codec), transitions
+    )
 
 
 def network_marginals(codec: Any) -> Marginals:

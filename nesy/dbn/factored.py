@@ -60,6 +60,8 @@ class Programs(NamedTuple):
     """int64 [O]."""
     out_strides: np.ndarray
     """int64 [O, V]."""
+    mixes: np.ndarray
+    """bool [O]: the operation mixes rows of one table, weighted by a belief for each parent: the usual case."""
     memory: int
     """Entries of one belief's memory: belief [N, K], result [N, K], intermediate tables."""
 
@@ -75,14 +77,16 @@ class _Planner:
     def plan(self, action: int, factor: int) -> None:
         """Marginal of one next factor under one action."""
         dbn, n, k = self.dbn, self.dbn.num_factors, self.dbn.num_values
-        pool, now = [], set()
+        pool: list[_Tensor] = []
+        now: set[int] = set()
         for i in ancestors(dbn, action, (factor,)):
-            scope = tuple(where * n + p for where, p in dbn.parents(action, i)) + (n + i,)
-            strides = tuple(k ** (len(scope) - 1 - axis) for axis in range(len(scope)))
-            pool.append(_Tensor(scope, True, int(dbn.offsets[action, i]) * k, strides))
+            axes = tuple(where * n + p for where, p in dbn.parents(action, i)) + (n + i,)
+            strides = tuple(k ** (len(axes) - 1 - axis) for axis in range(len(axes)))
+            pool.append(_Tensor(axes, True, int(dbn.offsets[action, i]) * k, strides))
             now |= set(dbn.parents_now[action][i])
         pool += [_Tensor((p,), False, p * k, (1,)) for p in sorted(now)]
         target = n + factor
+        out = _Tensor((target,), False, target * k, (1,))
         waiting = {v for tensor in pool for v in tensor.scope} - {target}
         while waiting:
             variable = min(waiting, key=lambda v: (len(_scope(pool, v)), v))
@@ -92,9 +96,12 @@ class _Planner:
             scope = {v for tensor in chosen for v in tensor.scope}
             # whatever occurs nowhere else is summed out in the same loop
             result = tuple(sorted(scope & elsewhere))
-            waiting -= scope - set(result)
-            pool.append(self._sum(chosen, result, tuple(sorted(scope - set(result)))))
-        out = _Tensor((target,), False, (n + factor) * k, (1,))
+            summed = tuple(sorted(scope - set(result)))
+            waiting -= set(summed)
+            if not pool and not waiting:
+                self.operations.append((result, summed, chosen, out))
+                return
+            pool.append(self._sum(chosen, result, summed))
         self.operations.append(((target,), (), pool, out))
 
     def _sum(self, chosen: list[_Tensor], result: tuple[int, ...], summed: tuple[int, ...]) -> _Tensor:
@@ -141,6 +148,7 @@ def plan_updates(dbn: TwoSliceDBN) -> Programs:
         inner=np.zeros((number, inputs), dtype=np.int64),
         out_base=np.array([out.offset for _, _, _, out in operations], dtype=np.int64),
         out_strides=np.zeros((number, width), dtype=np.int64),
+        mixes=np.array([_mixes(result, tensors) for result, _, tensors, _ in operations]),
         memory=planner.memory,
     )
     for o, ((_, _, tensors, out), (outer, summed, inner)) in enumerate(zip(operations, loops, strict=True)):
@@ -164,6 +172,18 @@ def _loops(
     """
     inner = max(v for v in result if v >= num_factors)
     return tuple(v for v in result if v != inner), summed, inner
+
+
+def _mixes(result: tuple[int, ...], tensors: list[_Tensor]) -> bool:
+    table, beliefs = tensors[0], tensors[1:]
+    weighted = [tensor.scope for tensor in beliefs]
+    return (
+        len(result) == 1
+        and table.shared
+        and not any(tensor.shared for tensor in beliefs)
+        and sorted(weighted) == sorted((v,) for v in table.scope[:-1])
+        and all(tensor.offset == v * table.strides[-2] for tensor in beliefs for v in tensor.scope)
+    )
 
 
 def _stride(tensor: _Tensor, variable: int) -> int:
@@ -240,6 +260,69 @@ def _sum_products(
 
 
 @njit(cache=True)
+def _mix_rows(
+    programs: Programs,
+    o: int,
+    tables: np.ndarray,
+    memory: np.ndarray,
+    support: np.ndarray,
+    sizes: np.ndarray,
+    digits: np.ndarray,
+    starts: np.ndarray,
+    weights: np.ndarray,
+    accumulator: np.ndarray,
+) -> None:
+    """One operation of the usual kind; weights and row starts are kept per depth, only the last parent's change."""
+    num_values = accumulator.shape[0]
+    loops = programs.num_loops[o]
+    accumulator[:] = 0.0
+    starts[0], weights[0] = programs.base[o, 0], 1.0
+    depth = 0
+    if loops > 0:
+        digits[0] = -1
+    else:
+        for k in range(num_values):
+            accumulator[k] = tables[starts[0] + k]
+    while depth >= 0 and loops > 0:
+        variable = programs.variables[o, depth]
+        stride = programs.strides[o, 0, depth]
+        if depth == loops - 1:
+            # four values at a time in registers: several times faster than adding rows in memory
+            belief, start, scale = variable * num_values, starts[depth], weights[depth]
+            k = 0
+            while k + 4 <= num_values:
+                a, b, c, d = accumulator[k], accumulator[k + 1], accumulator[k + 2], accumulator[k + 3]
+                for digit in range(sizes[variable]):
+                    value = support[variable, digit]
+                    weight = scale * memory[belief + value]
+                    row = start + stride * value + k
+                    a += weight * tables[row]
+                    b += weight * tables[row + 1]
+                    c += weight * tables[row + 2]
+                    d += weight * tables[row + 3]
+                accumulator[k], accumulator[k + 1], accumulator[k + 2], accumulator[k + 3] = a, b, c, d
+                k += 4
+            while k < num_values:
+                for digit in range(sizes[variable]):
+                    value = support[variable, digit]
+                    accumulator[k] += scale * memory[belief + value] * tables[start + stride * value + k]
+                k += 1
+            depth -= 1
+        else:
+            digits[depth] += 1
+            if digits[depth] == sizes[variable]:
+                depth -= 1
+            else:
+                value = support[variable, digits[depth]]
+                weights[depth + 1] = weights[depth] * memory[variable * num_values + value]
+                starts[depth + 1] = starts[depth] + stride * value
+                depth += 1
+                digits[depth] = -1
+    for k in range(num_values):
+        memory[programs.out_base[o] + k] = accumulator[k]
+
+
+@njit(cache=True)
 def _run(programs: Programs, tables: np.ndarray, beliefs: np.ndarray, actions: np.ndarray) -> np.ndarray:
     number, n, num_values = beliefs.shape
     result = np.empty((number, n, num_values))
@@ -251,6 +334,8 @@ def _run(programs: Programs, tables: np.ndarray, beliefs: np.ndarray, actions: n
             support[v, k] = k
     digits = np.zeros(programs.variables.shape[1], dtype=np.int64)
     offsets = np.zeros(programs.base.shape[1], dtype=np.int64)
+    starts = np.zeros(programs.variables.shape[1] + 1, dtype=np.int64)
+    weights = np.zeros(programs.variables.shape[1] + 1)
     accumulator, product = np.empty(num_values), np.empty(num_values)
     for b in range(number):
         for i in range(n):
@@ -261,7 +346,10 @@ def _run(programs: Programs, tables: np.ndarray, beliefs: np.ndarray, actions: n
                     support[i, sizes[i]] = k
                     sizes[i] += 1
         for o in range(programs.first[actions[b]], programs.first[actions[b] + 1]):
-            _sum_products(programs, o, tables, memory, support, sizes, digits, offsets, accumulator, product)
+            if programs.mixes[o]:
+                _mix_rows(programs, o, tables, memory, support, sizes, digits, starts, weights, accumulator)
+            else:
+                _sum_products(programs, o, tables, memory, support, sizes, digits, offsets, accumulator, product)
         for i in range(n):
             start = (n + i) * num_values
             total = 0.0

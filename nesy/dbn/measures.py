@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from nesy.dbn.extraction import Conditionals
 from nesy.dbn.factored import predict_batch
 from nesy.dbn.model import TwoSliceDBN
 
 if TYPE_CHECKING:
-    from nesy.dbn.extraction import Conditionals, Marginals, Transitions
+    from nesy.dbn.extraction import Marginals, Transitions
 
 FLOOR = 1e-12
 """Least probability that a likelihood is charged with, so that one impossible row does not hide the rest."""
@@ -40,7 +41,7 @@ def fidelity(dbn: TwoSliceDBN, model: Conditionals | Marginals | None, transitio
         "views_met": len(transitions.views),
     }
     figures |= nll(dbn, transitions.codes, transitions.actions, transitions.next_codes)
-    if hasattr(model, "conditional"):
+    if isinstance(model, Conditionals):
         figures["max_difference_to_network"] = max_difference(dbn, model)
     elif model is not None:
         figures["max_difference_to_network"] = max_marginal_difference(dbn, model, transitions.view_codes)
