@@ -175,6 +175,10 @@ class BatchedEnvironment(Protocol):
         """`[B]`: a stable hash of each map as generated."""
         ...
 
+    def states(self) -> list[dict[str, Any]]:
+        """The full state of every environment, as `env.unwrapped.state()` of a single one returns it."""
+        ...
+
 
 class PredicateVocabulary(Protocol):
     """Observable predicates of a view: named, with a one-line meaning, computed vectorised."""

@@ -1,0 +1,226 @@
+"""Compiled sweeps of the full-state optimum: rewards as tables, a pass backward and a pass forward.
+
+    state    (t, person state p, waiting w, steps at the goal g, lost counter l, robot pose c)
+
+`p` and `c` are numbers of a `PersonChain`. `g` is 0 on the way and 1 .. patience + 1 (saturating) at the goal.
+A step goes (p, w, c) -> the robot's new pose -> the person's new state -> reward; what follows the robot's
+move depends on the action only through a bumping penalty and through entering the goal, so the best
+continuation of every (person state, pose) is computed once per t and shared by all that lead there.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from domains.core import FORWARD, GOAL, STAY
+from domains.person_following.paths import step_x, step_y
+from domains.person_following.person_chain import PersonChain
+from domains.person_following.variants import (
+    R_FOLLOW_DISTANCE,
+    R_GOAL_PATIENCE,
+    R_LOOK_BACK,
+    R_MAX_LOST,
+    R_MAX_STEPS,
+    R_PERSON_REST,
+    R_ROBOT_REST,
+    Parameters,
+)
+
+NUM_ACTIONS = 4
+
+
+class StepTables(NamedTuple):
+    """What a step brings on one map, by person state [P] and robot pose [C] after the step."""
+
+    reward: NDArray[np.float64]  # [P, C]
+    bump: NDArray[np.float64]  # [P, C]: added where the robot's action was forward
+    far: NDArray[np.bool_]  # [P, C]: beyond the follow distance
+    won: NDArray[np.bool_]  # [P, C]
+    waits: NDArray[np.bool_]  # [P, C]: the person, before its move, wants to wait for a robot there
+    enters: NDArray[np.bool_]  # [C]: stepping forward from there enters the goal, if nobody blocks
+    moves: NDArray[np.int64]  # [P, C, 4]
+    successors: NDArray[np.int64]  # [P, 2]
+    at_goal: NDArray[np.bool_]  # [P]
+
+
+def step_tables(chain: PersonChain, parameters: Parameters) -> StepTables:
+    """The tables of one map under some parameters."""
+    people, poses = chain.person, chain.poses
+    x, y, h = poses[:, 0], poses[:, 1], poses[:, 2]
+    ahead = np.array([(step_x(k), step_y(k)) for k in range(4)])
+    front_x, front_y = x + ahead[h, 0], y + ahead[h, 1]
+    far = chain.distance > parameters.follow_distance
+    same = (people[:, None, 0] == x) & (people[:, None, 1] == y)
+    won = ~far & chain.visible & chain.at_goal[:, None]
+    near = np.where(chain.distance > 0, 1.5 / (1.0 + chain.distance), 0.0) + 0.5 * chain.visible
+    reward = np.where(far, -0.05 * chain.distance, near + 100.0 * won) - 0.01 * same
+    bump = np.where((people[:, None, 0] == front_x) & (people[:, None, 1] == front_y), -0.01, 0.0)
+    waits = (~chain.visible | far) if parameters.look_back else np.zeros_like(far)
+    return StepTables(
+        reward,
+        bump,
+        far,
+        won,
+        waits,
+        chain.grid[front_x, front_y] == GOAL,
+        chain.moves,
+        chain.successors,
+        chain.at_goal,
+    )
+
+
+@njit(cache=True)
+def reachable_states(rules, successors, reached):  # type: ignore[no-untyped-def]
+    """Mark in `reached` [T, P] the person states in which a step t can begin."""
+    reached[0, 0] = True
+    for t in range(reached.shape[0] - 1):
+        rests = rules[R_PERSON_REST] > 0 and (t + 1) % rules[R_PERSON_REST] == 0
+        for p in range(reached.shape[1]):
+            if reached[t, p]:
+                if rests or rules[R_LOOK_BACK]:
+                    reached[t + 1, p] = True
+                if not rests:
+                    reached[t + 1, successors[p, 0]] = True
+                    reached[t + 1, successors[p, 1]] = True
+
+
+@njit(cache=True)
+def sweep_backward(rules, tables, reached, discount, policy, value, total, success):  # type: ignore[no-untyped-def]
+    """Fill `policy` [T, P, W, G, L, C]; tables [2, P, W, G, L, C] end with t = 0 in their first half.
+
+    `value` is discounted; `total` and `success` are the undiscounted return and the success of the policy.
+    """
+    reward, bump, far, won, waits, enters, moves, successors, at_goal = tables
+    steps, people, num_waits, stands, losts, poses = policy.shape
+    patience, max_lost = rules[R_GOAL_PATIENCE], rules[R_MAX_LOST]
+    # Value, return and success of arriving at (p, w, g, l, c), the reward of arriving included.
+    arrive_value = np.zeros(value.shape[1:])
+    arrive_total = np.zeros(value.shape[1:])
+    arrive_success = np.zeros(value.shape[1:])
+    for t in range(steps - 1, -1, -1):
+        now, later = t & 1, (t + 1) & 1
+        last = t == steps - 1
+        for p in range(people):
+            if not last and not reached[t + 1, p]:
+                continue
+            for w in range(num_waits):
+                for g in range(stands):
+                    stood = min(g + 1, patience + 1) if at_goal[p] else 0
+                    for l in range(losts):  # noqa: E741
+                        for c in range(poses):
+                            v = reward[p, c]
+                            u = v
+                            s = 0.0
+                            ended = last
+                            lost = 0
+                            if far[p, c]:
+                                lost = l + 1
+                                ended = ended or lost >= max_lost or (at_goal[p] and stood > patience)
+                            elif won[p, c]:
+                                ended = True
+                                s = 1.0
+                            if not ended:
+                                v += discount * value[later, p, w, stood, lost, c]
+                                u += total[later, p, w, stood, lost, c]
+                                s += success[later, p, w, stood, lost, c]
+                            arrive_value[p, w, g, l, c] = v
+                            arrive_total[p, w, g, l, c] = u
+                            arrive_success[p, w, g, l, c] = s
+        rests = rules[R_PERSON_REST] > 0 and (t + 1) % rules[R_PERSON_REST] == 0
+        held = rules[R_ROBOT_REST] > 0 and (t + 1) % rules[R_ROBOT_REST] == 0
+        bonus = 1.0 - 0.9 * ((t + 1) / rules[R_MAX_STEPS])
+        for p in range(people):
+            if not reached[t, p]:
+                continue
+            first, second = successors[p, 0], successors[p, 1]
+            # On the way the counter is 0; at the goal it is at least 1.
+            low, high = (1, stands) if at_goal[p] else (0, 1)
+            for w in range(num_waits):
+                for g in range(low, high):
+                    for l in range(losts):  # noqa: E741
+                        for c in range(poses):
+                            best, best_total, best_success, chosen = -np.inf, 0.0, 0.0, 0
+                            for action in range(NUM_ACTIONS):
+                                act = STAY if held else action
+                                to = moves[p, c, act]
+                                a, b, w2 = first, second, 0
+                                if rests:
+                                    a, b, w2 = p, p, w
+                                elif waits[p, to] and w + 1 < 3:
+                                    a, b, w2 = p, p, w + 1
+                                v = 0.5 * (arrive_value[a, w2, g, l, to] + arrive_value[b, w2, g, l, to])
+                                u = 0.5 * (arrive_total[a, w2, g, l, to] + arrive_total[b, w2, g, l, to])
+                                s = 0.5 * (arrive_success[a, w2, g, l, to] + arrive_success[b, w2, g, l, to])
+                                if act == FORWARD:
+                                    extra = 0.5 * (bump[a, to] + bump[b, to])
+                                    if to != c and enters[c]:
+                                        # The episode ends here, with what this step alone brings.
+                                        extra += bonus
+                                        v = 0.5 * (reward[a, to] + reward[b, to])
+                                        u = v
+                                        s = 0.5 * (won[a, to] + won[b, to])
+                                    v += extra
+                                    u += extra
+                                if v > best + 1e-12:
+                                    best, best_total, best_success, chosen = v, u, s, action
+                            policy[t, p, w, g, l, c] = chosen
+                            value[now, p, w, g, l, c] = best
+                            total[now, p, w, g, l, c] = best_total
+                            success[now, p, w, g, l, c] = best_success
+
+
+@njit(cache=True)
+def follow_policy(rules, tables, policy, start, states, actions):  # type: ignore[no-untyped-def]
+    """Collect the states [n, 6] that the policy reaches from `start` at t = 0, and its actions [n]; returns n.
+
+    Collecting stops when the arrays are full.
+    """
+    _, _, far, won, waits, enters, moves, successors, at_goal = tables
+    patience = rules[R_GOAL_PATIENCE]
+    seen = np.zeros(policy.shape[1:], np.int32)
+    count = policy.shape[2]
+    for w in range(count):
+        for i in range(6):
+            states[w, i] = 0
+        states[w, 2] = w
+        states[w, 5] = start
+    done = 0
+    while done < count:
+        t, p, w, g, l, c = (  # noqa: E741
+            states[done, 0],
+            states[done, 1],
+            states[done, 2],
+            states[done, 3],
+            states[done, 4],
+            states[done, 5],
+        )
+        chosen = policy[t, p, w, g, l, c]
+        actions[done] = chosen
+        done += 1
+        if rules[R_ROBOT_REST] > 0 and (t + 1) % rules[R_ROBOT_REST] == 0:
+            chosen = STAY
+        to = moves[p, c, chosen]
+        if t + 1 >= policy.shape[0] or (chosen == FORWARD and to != c and enters[c]):
+            continue
+        for branch in range(2):
+            after, w2 = successors[p, branch], 0
+            if rules[R_PERSON_REST] > 0 and (t + 1) % rules[R_PERSON_REST] == 0:
+                after, w2 = p, w
+            elif waits[p, to] and w + 1 < 3:
+                after, w2 = p, w + 1
+            stood = min(g + 1, patience + 1) if at_goal[after] else 0
+            lost = l + 1 if far[after, to] else 0
+            ended = won[after, to] or lost >= rules[R_MAX_LOST]
+            if ended or (far[after, to] and at_goal[after] and stood > patience):
+                continue
+            if seen[after, w2, stood, lost, to] == t + 1 or count >= states.shape[0]:
+                continue
+            seen[after, w2, stood, lost, to] = t + 1
+            states[count, 0], states[count, 1], states[count, 2] = t + 1, after, w2
+            states[count, 3], states[count, 4], states[count, 5] = stood, lost, to
+            count += 1
+    return count
