@@ -77,8 +77,8 @@ class Facts:
             "cell": self._cells,
             "predicate": lambda: [f"predicate({p})." for p in self.predicates],
             "holds": self._holds,
-            "cooccurs": self._cooccurs,
-            "together": self._together,
+            "cooccurs": self.cooccurs,
+            "together": self.together,
         }
 
     @property
@@ -185,26 +185,35 @@ class Facts:
         for i, p in zip(views.tolist(), predicates.tolist(), strict=True):
             yield f"holds({i},{self.predicates[p]})."
 
-    def _cooccurs(self) -> Iterable[str]:
+    def cooccurs(self, factors: Iterable[int] | None = None, predicates: Iterable[str] | None = None) -> Iterable[str]:
+        """Facts cooccurs/5 of some factors and some predicates (constants); of all by default."""
         book, k = self._book(), self.dbn.num_values
-        truth = book.predicates.astype(np.int64)
-        for f in range(self.dbn.num_factors if len(book) else 0):
+        names, truth = self._chosen(predicates)
+        for f in range(self.dbn.num_factors) if factors is None else factors:
             chosen = (book.codes[:, f] == np.arange(k)[:, None]).astype(np.int64)
             hits, totals = (chosen @ truth).tolist(), chosen.sum(axis=1).tolist()
             for v in range(k):
                 if totals[v]:
-                    for p, name in enumerate(self.predicates):
+                    for p, name in enumerate(names):
                         yield f"cooccurs({f},{v},{name},{hits[v][p]},{totals[v]})."
 
-    def _together(self) -> Iterable[str]:
+    def together(self, predicates: Iterable[str] | None = None) -> Iterable[str]:
+        """Facts together/7 of some predicates (constants); of all by default."""
         book, k = self._book(), self.dbn.num_values
-        truth = book.predicates.astype(np.int64)
-        for f in range(self.dbn.num_factors if len(book) else 0):
+        names, truth = self._chosen(predicates)
+        for f in range(self.dbn.num_factors):
             for g in range(f + 1, self.dbn.num_factors):
                 pair = book.codes[:, f].astype(np.int64) * k + book.codes[:, g]
-                chosen = (pair == np.arange(k * k)[:, None]).astype(np.int64)
-                totals, hits = chosen.sum(axis=1), chosen @ truth
-                for c in np.flatnonzero(totals).tolist():
-                    v, u = divmod(c, k)
-                    for p, name in enumerate(self.predicates):
-                        yield f"together({f},{v},{g},{u},{name},{hits[c, p]},{totals[c]})."
+                met, index, totals = np.unique(pair, return_inverse=True, return_counts=True)
+                hits = np.stack(
+                    [np.bincount(index.reshape(-1), column, len(met)) for column in truth.T], axis=1
+                ).astype(np.int64)
+                for c, total, row in zip(met.tolist(), totals.tolist(), hits.tolist(), strict=True):
+                    for name, hit in zip(names, row, strict=True):
+                        yield f"together({f},{c // k},{g},{c % k},{name},{hit},{total})."
+
+    def _chosen(self, predicates: Iterable[str] | None) -> tuple[tuple[str, ...], np.ndarray]:
+        """Names of some predicates, and their truth in every view, int64 [V, P]."""
+        names = self.predicates if predicates is None else tuple(predicates)
+        columns = [self.predicates.index(name) for name in names]
+        return names, self._book().predicates[:, columns].astype(np.int64)

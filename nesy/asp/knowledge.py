@@ -21,6 +21,7 @@ from nesy.dbn.codebook import Codebook
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
 
+MOST_LINES = 8
 ENCODINGS = Path(__file__).with_name("encodings")
 
 
@@ -89,7 +90,7 @@ class KnowledgeBase:
         if not 0 <= value < self.dbn.num_values:
             raise UserError(f"no value {value}; the values of a factor are 0 to {self.dbn.num_values - 1}")
         book = self._book()
-        facts = self.facts.text(("cooccurs", "predicate"))
+        facts = self.facts.text(("predicate",)) + "\n".join(self.facts.cooccurs(factors=(f,)))
         totals = "".join(
             f"seen_of({name},{count},{len(book)})."
             for name, count in zip(self.facts.predicates, book.predicates.sum(axis=0).tolist(), strict=True)
@@ -164,8 +165,9 @@ class KnowledgeBase:
         started = time.perf_counter()
         book = self._book()
         truth = book.predicate(predicate)
-        facts = self.facts.text(("cooccurs", "together"))
-        atoms = self._ask("implies", f"asked({asp_name(predicate)}). least({_percent(least)}). {facts}")
+        name = asp_name(predicate)
+        facts = "\n".join([*self.facts.cooccurs(predicates=(name,)), *self.facts.together(predicates=(name,))])
+        atoms = self._ask("implies", f"asked({name}). least({_percent(least)}). {facts}")
         rows = []
         for atom in atoms:
             numbers = [argument.number for argument in atom.arguments]
@@ -279,13 +281,16 @@ class KnowledgeBase:
             return f"{name}: no view met in experience has this value."
         lines = [f"{name} ({rows[0]['of']} of {len(self._book())} distinct views):"]
         words = {"means": "holds", "excludes": "does not hold"}
-        for row in rows:
-            if row["relation"] in words:
+        for relation in words:
+            chosen = [row for row in rows if row["relation"] == relation]
+            for row in chosen[:MOST_LINES]:
                 share = _percentage(row["views"], row["of"])
                 lines.append(
-                    f"  {row['predicate']} {words[row['relation']]}: true in {share} of them, "
+                    f"  {row['predicate']} {words[relation]}: true in {share} of them, "
                     f"in {100 * row['of_all_views']:.1f} % of all views"
                 )
+            if len(chosen) > MOST_LINES:
+                lines.append(f"  ... and {len(chosen) - MOST_LINES} predicates more that {words[relation]}")
         mixed = [r for r in rows if r["relation"] == "mixed"][:3]
         if len(lines) == 1:
             lines.append("  no predicate is decided by this value alone; the nearest:")

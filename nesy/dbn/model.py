@@ -324,14 +324,17 @@ class TwoSliceDBN:
             "value_meanings": [list(texts) for texts in self.value_meanings],
             "provenance": self.provenance,
         }
-        arrays = {"probabilities": self.probabilities, "row_counts": self.row_counts, "initial": self.initial}
-        storage.save(
-            Path(path),
-            "model",
-            "tables",
-            document,
-            arrays | {f"table_{k}": v for k, v in self.tables.items()},
-        )
+        met = np.flatnonzero(self.row_counts)
+        distinct, index = distinct_rows(self.probabilities)
+        arrays = {
+            "distinct_rows": distinct,
+            "row_index": index,
+            "met_rows": met,
+            "met_counts": self.row_counts[met],
+            "initial": self.initial,
+        }
+        extra = {f"table_{name}": table for name, table in self.tables.items()}
+        storage.save(Path(path), "model", "tables", document, arrays | extra)
 
     @classmethod
     def load(cls, path: Path | str) -> TwoSliceDBN:
@@ -354,8 +357,8 @@ class TwoSliceDBN:
                 parents_now=_parents(document["parents_now"]),
                 parents_next=_parents(document["parents_next"]),
                 order=tuple(int(i) for i in document["order"]),
-                probabilities=arrays["probabilities"],
-                row_counts=arrays["row_counts"],
+                probabilities=_expanded(arrays["distinct_rows"], arrays["row_index"]),
+                row_counts=_scattered(arrays["met_rows"], arrays["met_counts"], len(arrays["row_index"])),
                 initial=arrays["initial"],
                 value_meanings=tuple(_strings(texts) for texts in document["value_meanings"]),
                 provenance=dict(document["provenance"]),
@@ -363,7 +366,7 @@ class TwoSliceDBN:
             )
         except UserError as error:
             raise UserError(f"{path / 'model.json'}: {error}") from None
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError, IndexError) as error:
             raise UserError(f"{path / 'model.json'}: does not describe a 2DBN ({error!r})") from None
 
     # ---------------------------------------------------------------- checks
@@ -408,3 +411,37 @@ def _strings(value: Any) -> tuple[str, ...]:
 
 def _parents(value: Any) -> Parents:
     return tuple(tuple(tuple(int(p) for p in ps) for ps in per_action) for per_action in value)
+
+
+def distinct_rows(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The distinct rows of a table, and which one every row is: most rows of a large table are never met.
+
+    Args:
+        table: float64 [R, K].
+
+    Returns:
+        float64 [U, K] and uint32 [R].
+    """
+    bits = np.ascontiguousarray(table).view(np.uint64)
+    odd = np.random.default_rng(0).integers(1 << 62, size=bits.shape[1], dtype=np.uint64) * np.uint64(2) + np.uint64(1)
+    mixed = bits ^ (bits >> np.uint64(29))
+    _, first, index = np.unique((mixed * odd).sum(axis=1, dtype=np.uint64), return_index=True, return_inverse=True)
+    index = index.reshape(-1).astype(np.uint32)
+    if not np.array_equal(bits[first][index], bits):  # two rows with one hash
+        distinct, exact = np.unique(bits, axis=0, return_inverse=True)
+        return distinct.view(np.float64), exact.reshape(-1).astype(np.uint32)
+    return table[first], index
+
+
+def _expanded(distinct: np.ndarray, index: np.ndarray) -> np.ndarray:
+    if distinct.ndim != 2 or distinct.dtype != np.float64 or index.ndim != 1 or index.dtype != np.uint32:
+        raise ValueError("the rows are not float64 [U, K] with an index uint32 [R]")
+    return distinct[index]
+
+
+def _scattered(rows: np.ndarray, counts: np.ndarray, number: int) -> np.ndarray:
+    if rows.dtype != np.int64 or counts.dtype != np.int64 or rows.shape != counts.shape or (rows < 0).any():
+        raise ValueError("the counts are not int64 numbers for rows")
+    result = np.zeros(number, dtype=np.int64)
+    result[rows] = counts
+    return result

@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from nesy.dbn.codebook import Codebook
-from nesy.dbn.model import TwoSliceDBN
+from nesy.dbn.model import TwoSliceDBN, distinct_rows
 from nesy.errors import UserError
 from tests.nesy.dbn.models import random_dbn
 from tests.nesy.dbn.toy import toy
@@ -145,7 +145,8 @@ def test_tables_that_are_no_distributions_are_found(saved, tmp_path, value):
     shutil.copytree(saved, folder)
     table = toy()[0].probabilities.copy()
     table[0, 0] = value
-    forge(folder, lambda document: None, {"probabilities": table})
+    distinct, index = distinct_rows(table)
+    forge(folder, lambda document: None, {"distinct_rows": distinct, "row_index": index})
     with pytest.raises(UserError, match="distribution"):
         TwoSliceDBN.load(folder)
 
@@ -198,3 +199,23 @@ def test_a_failed_save_keeps_the_old_model(saved, tmp_path, monkeypatch):
         toy()[0].save(folder)
     assert (folder / "model.json").read_bytes() == before
     assert not list(folder.glob(".*tmp*"))
+
+
+def test_arrays_that_point_outside_are_found(saved, tmp_path):
+    index = np.full(len(toy()[0].probabilities), 10**6, dtype=np.uint32)
+    for arrays in ({"row_index": index}, {"met_rows": np.array([-1]), "met_counts": np.array([1])}):
+        folder = tmp_path / str(len(list(tmp_path.iterdir())))
+        shutil.copytree(saved, folder)
+        forge(folder, lambda document: None, arrays)
+        with pytest.raises(UserError, match="does not describe"):
+            TwoSliceDBN.load(folder)
+
+
+def test_rows_never_met_take_little_room(tmp_path):
+    rng = np.random.default_rng(0)
+    table = np.full((8**5, 8), 1 / 8)
+    table[rng.integers(8**5, size=100)] = rng.dirichlet(np.ones(8), size=100)
+    dbn = TwoSliceDBN.from_tables([[table] * 8], [[list(range(5))] * 8])
+    dbn.save(tmp_path)
+    assert (tmp_path / "tables.npz").stat().st_size < dbn.probabilities.nbytes / 10
+    assert same(TwoSliceDBN.load(tmp_path), dbn)
