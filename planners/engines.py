@@ -66,7 +66,7 @@ def _run(job: CellJob, advance: Any) -> None:
 def _run_in_processes(jobs_of: list[CellJob], jobs: int, task: Task) -> None:
     context = multiprocessing.get_context("spawn")
     waiting = list(jobs_of)
-    for attempt in range(_ATTEMPTS):
+    for _ in range(_ATTEMPTS):
         reports = context.SimpleQueue()
         failed: list[CellJob] = []
         with ProcessPoolExecutor(min(jobs, len(waiting)), context, _begin_worker, (reports,)) as pool:
@@ -89,7 +89,7 @@ def _run_in_processes(jobs_of: list[CellJob], jobs: int, task: Task) -> None:
             return
         waiting = failed
     names = ", ".join(job[0].name for job in waiting)
-    raise UserError(f"worker processes keep dying ({attempt + 1} attempts); still to do: {names}; try fewer --jobs")
+    raise UserError(f"worker processes keep dying ({_ATTEMPTS} attempts); still to do: {names}; try fewer --jobs")
 
 
 def _begin_worker(reports: Any) -> None:

@@ -2,8 +2,8 @@
 
 A tree asks one question about one parent per node ("factor 3 is 5", "ahead <= 2"), so a table over a dozen
 parents needs only as many rows as there are contexts that make a difference. Rows keep their counts. Growth
-is greedy and stops where the gain in log-likelihood no longer pays for the parameters it adds (BIC), which is
-a table's usual score; no other stopping rule is needed.
+is greedy and stops where the gain in log-likelihood no longer pays for saying which question is asked and for
+the parameters that it adds (a two-part code, which is BIC within the node); no other stopping rule is needed.
 
 Every table is learned from (parents, target) pairs and knows nothing about what they mean.
 """
@@ -169,16 +169,17 @@ def _learn(variables: np.ndarray, parents: Parents, moments: np.ndarray, kind: s
     columns = np.ascontiguousarray(variables[:, list(parents.slots)].T.astype(np.int32))
     if columns.min() < 0:
         raise ValueError("the parents of a table must be non-negative integers")
-    parameters = moments.shape[1] - 1 if kind == "distribution" else 2
-    total = max(moments[:, 0].sum() if kind == "mean" else moments.sum(), 2.0)
-    penalty = 0.5 * parameters * np.log(total)
+    sizes = columns.max(axis=1).astype(np.int64) + 1
+    questions = sum(
+        int(size) * (2 if is_ordered else 1) for size, is_ordered in zip(sizes, parents.ordered, strict=True)
+    )
     slot, value, ordered, yes, no, node_moments = _grow(
         columns,
         np.array(parents.ordered, dtype=np.bool_),
-        columns.max(axis=1).astype(np.int64) + 1,
+        sizes,
         moments,
         kind == "mean",
-        penalty,
+        float(np.log(questions)),
     )
     slots = np.array(parents.slots, dtype=np.int32)
     slot = np.where(slot >= 0, slots[np.maximum(slot, 0)], -1).astype(np.int32)
@@ -214,13 +215,20 @@ def _best_split(
     sizes: np.ndarray,
     moments: np.ndarray,
     mean: bool,
-    penalty: float,
+    log_questions: float,
     rows: np.ndarray,
     here: np.ndarray,
     node: int,
 ) -> tuple[int, int, bool]:
-    """Feature, value and kind of the question that gains most over `penalty` at `node`; feature -1 if none does."""
+    """Feature, value and kind of the question that gains most at `node`; feature -1 if none pays for itself."""
     width = moments.shape[1]
+    total, classes = 0.0, 0.0
+    for k in range(width):
+        total += here[node, k]
+        classes += 1.0 if here[node, k] > 0.0 else 0.0
+    if mean:
+        total, classes = here[node, 0], 3.0
+    penalty = log_questions + 0.5 * (classes - 1.0) * np.log(max(total, 2.0))
     zero = np.zeros((1, width))
     base = _score(here, node, zero, 0, mean)
     best_gain, best_feature, best_value, best_ordered = penalty, -1, 0, False
@@ -251,7 +259,7 @@ def _best_split(
 
 @njit(cache=True)
 def _grow(
-    columns: np.ndarray, ordered: np.ndarray, sizes: np.ndarray, moments: np.ndarray, mean: bool, penalty: float
+    columns: np.ndarray, ordered: np.ndarray, sizes: np.ndarray, moments: np.ndarray, mean: bool, log_questions: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     n = columns.shape[1]
     width = moments.shape[1]
@@ -274,7 +282,7 @@ def _grow(
     node = 0
     while node < nodes:  # breadth first: a parent always comes before its children
         feature, split, less = _best_split(
-            columns, ordered, sizes, moments, mean, penalty, index[begin[node] : end[node]], here, node
+            columns, ordered, sizes, moments, mean, log_questions, index[begin[node] : end[node]], here, node
         )
         if feature >= 0:
             front, back = begin[node], 0
