@@ -46,7 +46,7 @@ PRESETS: dict[str, RunConfig] = {
     "smoke": RunConfig(
         preset="smoke",
         collect=CollectConfig(crossing_episodes=200, following_episodes=200, shard_episodes=100),
-        train=TrainConfig(epochs=4, time_limit=8.0),
+        train=TrainConfig(epochs=4, time_limit=0.0),
         compare=CompareConfig(
             episodes=42,
             planner_episodes=4,
@@ -56,7 +56,7 @@ PRESETS: dict[str, RunConfig] = {
         ),
     ),
     # The demo: everything for real within six minutes on two cores.
-    "quick": RunConfig(preset="quick", train=TrainConfig(time_limit=60.0)),
+    "quick": RunConfig(preset="quick", train=TrainConfig(time_limit=0.0)),
     # As much experience and learning as the paper reports.
     "paper": RunConfig(
         preset="paper",
