@@ -268,8 +268,22 @@ class Domain(Protocol):
         """
         ...
 
-    def views(self, variant: str = "paper", **parameters: Any) -> NDArray[np.uint8]:
-        """All distinct views `[V, v, v]` over maps and poses, sorted."""
+    def views(self, variant: str = "paper", task: str = "following", **parameters: Any) -> NDArray[np.uint8]:
+        """All distinct views [V, v, v] over maps and poses, sorted.
+
+        Raises:
+            DomainError: the set is too large to be listed.
+        """
+        ...
+
+    def transitions(
+        self, variant: str = "paper", task: str = "following", **parameters: Any
+    ) -> tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64], NDArray[np.uint8]]:
+        """Every step from every pose of every map, nobody else in the way: map, view, action, next view.
+
+        Raises:
+            DomainError: the set is too large to be listed.
+        """
         ...
 
     def optimum(self, variant: str = "paper", discount: float = 0.9, **parameters: Any) -> OracleResult:

@@ -17,8 +17,16 @@ import pyarrow.parquet as pq
 from nesy.errors import UserError
 from nesy.run_folder import atomic_path
 
-SOURCES = ("crossing-random", "crossing-expert", "following-random", "following-expert", "following-mixture")
-"""Who acted, in which task; the column `source` holds one of these."""
+SOURCES = (
+    "crossing-random",
+    "crossing-expert",
+    "crossing-explore",
+    "following-random",
+    "following-expert",
+    "following-mixture",
+)
+"""In which task, and who acted; the column `source` holds one of these. `crossing-explore` is a walk on maps as
+they are in person following, whose freed cells the generated maps of the crossing task lack."""
 
 _VIEWS = ("view", "next_view", "person_view", "next_person_view")
 _POSES = ("relative_pose", "next_relative_pose")
@@ -89,9 +97,7 @@ class Experience:
         folder = Path(folder)
         wanted = None if sources is None else set(sources)
         if wanted is not None and not wanted <= set(SOURCES):
-            raise UserError(
-                f"unknown experience source {sorted(wanted - set(SOURCES))}; known: {', '.join(SOURCES)}"
-            )
+            raise UserError(f"unknown experience source {sorted(wanted - set(SOURCES))}; known: {', '.join(SOURCES)}")
         parts = sorted(folder.glob("part-*.parquet"))
         if not parts:
             raise UserError(f"{folder}: no experience here (no part-*.parquet); make it with: nesy collect")
@@ -160,9 +166,7 @@ def write_part(path: Path, columns: Mapping[str, np.ndarray | Sequence[str]]) ->
         values = np.asarray(columns[name])
         assert len(values) == rows, f"{name}: {len(values)} rows, not {rows}"
         if name == "source":
-            arrays.append(
-                pa.array(values.astype(object)).dictionary_encode().cast(schema(cells).field(name).type)
-            )
+            arrays.append(pa.array(values.astype(object)).dictionary_encode().cast(schema(cells).field(name).type))
         elif name in _VIEWS:
             flat = np.ascontiguousarray(values.reshape(rows * cells), dtype=np.uint8)
             arrays.append(pa.FixedSizeListArray.from_arrays(pa.array(flat), cells))
@@ -193,9 +197,7 @@ def _read_part(path: Path, sources: set[str] | None) -> dict[str, np.ndarray] | 
             table = pq.read_table(stream)
     except (OSError, pa.ArrowException) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise UserError(
-            f"{path}: damaged, cannot be read as Parquet ({reason}); delete it, collect again"
-        ) from None
+        raise UserError(f"{path}: damaged, cannot be read as Parquet ({reason}); delete it, collect again") from None
     missing = [name for name in COLUMNS if name not in table.column_names]
     if missing:
         raise UserError(f"{path}: not a part of experience, columns missing: {', '.join(missing)}")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from domains.core import DomainSpec, OracleResult, ViewGeometry
-from domains.person_following.enumeration import all_maps, all_views
+from domains.person_following.enumeration import all_maps, all_transitions, all_views
 from domains.person_following.predicates import ViewPredicates
 from domains.person_following.variants import VARIANTS, parameters_of
 from domains.person_following.vector_env import PersonFollowingVectorEnv
@@ -58,6 +58,13 @@ class PersonFollowing:
         """All distinct views over maps and poses, sorted; person following adds those of the freed cell."""
         grids, _ = _maps(variant, tuple(sorted(parameters.items())))
         return all_views(grids, parameters_of(variant, task, **parameters), following=task == "following")
+
+    def transitions(
+        self, variant: str = "paper", task: str = "following", **parameters: Any
+    ) -> tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64], NDArray[np.uint8]]:
+        """Every step from every pose of every map: map index, view, action, next view."""
+        grids, _ = _maps(variant, tuple(sorted(parameters.items())))
+        return all_transitions(grids, parameters_of(variant, task, **parameters), following=task == "following")
 
     def optimum(self, variant: str = "paper", discount: float = 0.9, **parameters: Any) -> OracleResult:
         """The exact full-state optimum over the maps of a variant, weighted as the generator draws them."""

@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from domains.core import EMPTY, GOAL, WALL, DomainError
+from domains.person_following.paths import step_x, step_y
 from domains.person_following.variants import Parameters
 from domains.person_following.views import look
 
@@ -91,6 +92,48 @@ def all_views(grids: NDArray[np.uint8], parameters: Parameters, *, following: bo
     views = np.empty((len(grids) * 4 * parameters.size**2, width, width), np.uint8)
     count = _collect_views(played, parameters.see_through_walls, views)
     return np.unique(views[:count], axis=0)
+
+
+def all_transitions(
+    grids: NDArray[np.uint8], parameters: Parameters, *, following: bool
+) -> tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64], NDArray[np.uint8]]:
+    """Every step from every pose on a free cell of every map, nobody else being in the way.
+
+    Returns:
+        map index [T], view [T, v, v], action [T] and next view [T, v, v].
+    """
+    played = grids.copy()
+    if following:
+        played[:, 2, 2] = EMPTY
+    width = parameters.view_size
+    total = int((played != WALL).sum()) * 16
+    places, actions = np.empty(total, np.int64), np.empty(total, np.int64)
+    views = np.empty((2, total, width, width), np.uint8)
+    _collect_transitions(played, parameters.see_through_walls, places, views[0], actions, views[1])
+    return places, views[0], actions, views[1]
+
+
+@njit(cache=True)
+def _collect_transitions(grids, see_through_walls, places, before, actions, after):  # type: ignore[no-untyped-def]
+    count = 0
+    for m in range(grids.shape[0]):
+        for x in range(grids.shape[1]):
+            for y in range(grids.shape[2]):
+                if grids[m, x, y] == WALL:
+                    continue
+                for heading in range(4):
+                    for action in range(4):
+                        nx, ny, turned = x, y, heading
+                        if action == 0:
+                            turned = (heading + 3) % 4
+                        elif action == 1:
+                            turned = (heading + 1) % 4
+                        elif action == 2 and grids[m, x + step_x(heading), y + step_y(heading)] != WALL:
+                            nx, ny = x + step_x(heading), y + step_y(heading)
+                        places[count], actions[count] = m, action
+                        look(grids[m], x, y, heading, see_through_walls, before[count])
+                        look(grids[m], nx, ny, turned, see_through_walls, after[count])
+                        count += 1
 
 
 @njit(cache=True)
