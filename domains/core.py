@@ -78,9 +78,7 @@ class ViewGeometry:
             raise DomainError(f"a relative heading must be in 0..3, got {heading!r}")
         return np.asarray(1 + (x * self.view_size + y) * 4 + h)
 
-    def decode(
-        self, configuration: ArrayLike
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    def decode(self, configuration: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """(vx, vy, relative heading) of configurations; all three are -1 where the agent is unseen.
 
         Raises:
@@ -145,9 +143,7 @@ class BatchedEnvironment(Protocol):
 
     def step(
         self, actions: NDArray[np.int64]
-    ) -> tuple[
-        dict[str, NDArray[Any]], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
-    ]:
+    ) -> tuple[dict[str, NDArray[Any]], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """Take one action `[B]` per environment: observation, reward, terminated, truncated, infos."""
         ...
 
@@ -258,9 +254,7 @@ class Domain(Protocol):
         """
         ...
 
-    def maps(
-        self, variant: str = "paper", **parameters: Any
-    ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    def maps(self, variant: str = "paper", **parameters: Any) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
         """The distinct maps `[M, size, size]` and the generator's probabilities `[M]`.
 
         Raises:

@@ -47,9 +47,7 @@ class PersonFollowing:
         env.pending_seed = seed
         return env
 
-    def maps(
-        self, variant: str = "paper", **parameters: Any
-    ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    def maps(self, variant: str = "paper", **parameters: Any) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
         """The distinct maps as generated, sorted, and the generator's probabilities."""
         grids, weights = _maps(variant, tuple(sorted(parameters.items())))
         return grids.copy(), weights.copy()
@@ -75,9 +73,7 @@ class PersonFollowing:
 
 
 @lru_cache(maxsize=16)
-def _maps(
-    variant: str, parameters: tuple[tuple[str, Any], ...]
-) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+def _maps(variant: str, parameters: tuple[tuple[str, Any], ...]) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     return all_maps(parameters_of(variant, **dict(parameters)))
 
 

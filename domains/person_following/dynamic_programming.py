@@ -1,6 +1,6 @@
 """Compiled sweeps of the full-state optimum: rewards as tables, a pass backward and a pass forward.
 
-    state    (t, person state p, waiting w, steps at the goal g, lost counter l, robot pose c)
+    state    (t, person state p, waiting w, robot pose c, steps at the goal g, lost counter l)
 
 `p` and `c` are numbers of a `PersonChain`. `g` is 0 on the way and 1 .. patience + 1 (saturating) at the goal.
 A step goes (p, w, c) -> the robot's new pose -> the person's new state -> reward; what follows the robot's
@@ -20,9 +20,7 @@ from domains.core import FORWARD, GOAL, STAY
 from domains.person_following.paths import step_x, step_y
 from domains.person_following.person_chain import PersonChain
 from domains.person_following.variants import (
-    R_FOLLOW_DISTANCE,
     R_GOAL_PATIENCE,
-    R_LOOK_BACK,
     R_MAX_LOST,
     R_MAX_STEPS,
     R_PERSON_REST,
@@ -75,102 +73,124 @@ def step_tables(chain: PersonChain, parameters: Parameters) -> StepTables:
 
 @njit(cache=True)
 def reachable_states(rules, successors, reached):  # type: ignore[no-untyped-def]
-    """Mark in `reached` [T, P] the person states in which a step t can begin."""
-    reached[0, 0] = True
+    """Mark in `reached` [T, P, W] the person states and waiting counters in which a step t can begin."""
+    for w in range(reached.shape[2]):
+        reached[0, 0, w] = True
     for t in range(reached.shape[0] - 1):
         rests = rules[R_PERSON_REST] > 0 and (t + 1) % rules[R_PERSON_REST] == 0
         for p in range(reached.shape[1]):
-            if reached[t, p]:
-                if rests or rules[R_LOOK_BACK]:
-                    reached[t + 1, p] = True
-                if not rests:
-                    reached[t + 1, successors[p, 0]] = True
-                    reached[t + 1, successors[p, 1]] = True
+            for w in range(reached.shape[2]):
+                if not reached[t, p, w]:
+                    continue
+                if rests:
+                    reached[t + 1, p, w] = True
+                    continue
+                if w + 1 < reached.shape[2]:
+                    reached[t + 1, p, w + 1] = True
+                reached[t + 1, successors[p, 0], 0] = True
+                reached[t + 1, successors[p, 1], 0] = True
+
+
+@njit(cache=True)
+def _arrive(rules, tables, reached, discount, t, value, total, success, arrive):  # type: ignore[no-untyped-def]
+    """Fill `arrive` [3, P, W, C, G, L]: what arriving in a state at the end of step t is worth."""
+    reward, _, far, won, _, _, _, _, at_goal = tables
+    patience, max_lost = rules[R_GOAL_PATIENCE], rules[R_MAX_LOST]
+    _, people, waits, poses, stands, losts = arrive.shape
+    last = t == reached.shape[0] - 1
+    later = (t + 1) & 1
+    for p in range(people):
+        for w in range(waits):
+            if not last and not reached[t + 1, p, w]:
+                continue
+            for c in range(poses):
+                for g in range(stands):
+                    stood = min(g + 1, patience + 1) if at_goal[p] else 0
+                    for l in range(losts):  # noqa: E741
+                        v = reward[p, c]
+                        u = v
+                        s = 0.0
+                        ended = last
+                        lost = 0
+                        if far[p, c]:
+                            lost = l + 1
+                            ended = ended or lost >= max_lost or (at_goal[p] and stood > patience)
+                        elif won[p, c]:
+                            ended = True
+                            s = 1.0
+                        if not ended:
+                            v += discount * value[later, p, w, c, stood, lost]
+                            u += total[later, p, w, c, stood, lost]
+                            s += success[later, p, w, c, stood, lost]
+                        arrive[0, p, w, c, g, l] = v
+                        arrive[1, p, w, c, g, l] = u
+                        arrive[2, p, w, c, g, l] = s
 
 
 @njit(cache=True)
 def sweep_backward(rules, tables, reached, discount, policy, value, total, success):  # type: ignore[no-untyped-def]
-    """Fill `policy` [T, P, W, G, L, C]; tables [2, P, W, G, L, C] end with t = 0 in their first half.
+    """Fill `policy` [T, P, W, C, G, L]; tables [2, P, W, C, G, L] end with t = 0 in their first half.
 
     `value` is discounted; `total` and `success` are the undiscounted return and the success of the policy.
     """
-    reward, bump, far, won, waits, enters, moves, successors, at_goal = tables
-    steps, people, num_waits, stands, losts, poses = policy.shape
-    patience, max_lost = rules[R_GOAL_PATIENCE], rules[R_MAX_LOST]
-    # Value, return and success of arriving at (p, w, g, l, c), the reward of arriving included.
-    arrive_value = np.zeros(value.shape[1:])
-    arrive_total = np.zeros(value.shape[1:])
-    arrive_success = np.zeros(value.shape[1:])
+    reward, bump, _, won, waits, enters, moves, successors, at_goal = tables
+    steps, people, num_waits, poses, stands, losts = policy.shape
+    arrive = np.zeros((3, people, num_waits, poses, stands, losts))
+    first, second = np.empty(NUM_ACTIONS, np.int64), np.empty(NUM_ACTIONS, np.int64)
+    waiting, to = np.empty(NUM_ACTIONS, np.int64), np.empty(NUM_ACTIONS, np.int64)
+    extra, ends = np.empty(NUM_ACTIONS), np.empty(NUM_ACTIONS, np.bool_)
     for t in range(steps - 1, -1, -1):
-        now, later = t & 1, (t + 1) & 1
-        last = t == steps - 1
-        for p in range(people):
-            if not last and not reached[t + 1, p]:
-                continue
-            for w in range(num_waits):
-                for g in range(stands):
-                    stood = min(g + 1, patience + 1) if at_goal[p] else 0
-                    for l in range(losts):  # noqa: E741
-                        for c in range(poses):
-                            v = reward[p, c]
-                            u = v
-                            s = 0.0
-                            ended = last
-                            lost = 0
-                            if far[p, c]:
-                                lost = l + 1
-                                ended = ended or lost >= max_lost or (at_goal[p] and stood > patience)
-                            elif won[p, c]:
-                                ended = True
-                                s = 1.0
-                            if not ended:
-                                v += discount * value[later, p, w, stood, lost, c]
-                                u += total[later, p, w, stood, lost, c]
-                                s += success[later, p, w, stood, lost, c]
-                            arrive_value[p, w, g, l, c] = v
-                            arrive_total[p, w, g, l, c] = u
-                            arrive_success[p, w, g, l, c] = s
+        now = t & 1
+        _arrive(rules, tables, reached, discount, t, value, total, success, arrive)
         rests = rules[R_PERSON_REST] > 0 and (t + 1) % rules[R_PERSON_REST] == 0
         held = rules[R_ROBOT_REST] > 0 and (t + 1) % rules[R_ROBOT_REST] == 0
         bonus = 1.0 - 0.9 * ((t + 1) / rules[R_MAX_STEPS])
         for p in range(people):
-            if not reached[t, p]:
-                continue
-            first, second = successors[p, 0], successors[p, 1]
-            # On the way the counter is 0; at the goal it is at least 1.
+            # On the way the counter at the goal is 0; at the goal it is at least 1.
             low, high = (1, stands) if at_goal[p] else (0, 1)
             for w in range(num_waits):
-                for g in range(low, high):
-                    for l in range(losts):  # noqa: E741
-                        for c in range(poses):
-                            best, best_total, best_success, chosen = -np.inf, 0.0, 0.0, 0
+                if not reached[t, p, w]:
+                    continue
+                for c in range(poses):
+                    for action in range(NUM_ACTIONS):
+                        act = STAY if held else action
+                        to[action] = moves[p, c, act]
+                        first[action], second[action] = successors[p, 0], successors[p, 1]
+                        waiting[action] = 0
+                        if rests:
+                            first[action], second[action], waiting[action] = p, p, w
+                        elif waits[p, to[action]] and w + 1 < 3:
+                            first[action], second[action], waiting[action] = p, p, w + 1
+                        extra[action], ends[action] = 0.0, False
+                        if act == FORWARD:
+                            extra[action] = 0.5 * (bump[first[action], to[action]] + bump[second[action], to[action]])
+                            if to[action] != c and enters[c]:
+                                # The episode ends here, with what this step alone brings.
+                                extra[action] += bonus
+                                ends[action] = True
+                    for g in range(low, high):
+                        for l in range(losts):  # noqa: E741
+                            best, chosen = -np.inf, 0
                             for action in range(NUM_ACTIONS):
-                                act = STAY if held else action
-                                to = moves[p, c, act]
-                                a, b, w2 = first, second, 0
-                                if rests:
-                                    a, b, w2 = p, p, w
-                                elif waits[p, to] and w + 1 < 3:
-                                    a, b, w2 = p, p, w + 1
-                                v = 0.5 * (arrive_value[a, w2, g, l, to] + arrive_value[b, w2, g, l, to])
-                                u = 0.5 * (arrive_total[a, w2, g, l, to] + arrive_total[b, w2, g, l, to])
-                                s = 0.5 * (arrive_success[a, w2, g, l, to] + arrive_success[b, w2, g, l, to])
-                                if act == FORWARD:
-                                    extra = 0.5 * (bump[a, to] + bump[b, to])
-                                    if to != c and enters[c]:
-                                        # The episode ends here, with what this step alone brings.
-                                        extra += bonus
-                                        v = 0.5 * (reward[a, to] + reward[b, to])
-                                        u = v
-                                        s = 0.5 * (won[a, to] + won[b, to])
-                                    v += extra
-                                    u += extra
+                                a, b, w2, c2 = first[action], second[action], waiting[action], to[action]
+                                if ends[action]:
+                                    v = 0.5 * (reward[a, c2] + reward[b, c2])
+                                else:
+                                    v = 0.5 * (arrive[0, a, w2, c2, g, l] + arrive[0, b, w2, c2, g, l])
+                                v += extra[action]
                                 if v > best + 1e-12:
-                                    best, best_total, best_success, chosen = v, u, s, action
-                            policy[t, p, w, g, l, c] = chosen
-                            value[now, p, w, g, l, c] = best
-                            total[now, p, w, g, l, c] = best_total
-                            success[now, p, w, g, l, c] = best_success
+                                    best, chosen = v, action
+                            a, b, w2, c2 = first[chosen], second[chosen], waiting[chosen], to[chosen]
+                            if ends[chosen]:
+                                u = 0.5 * (reward[a, c2] + reward[b, c2])
+                                s = 0.5 * (won[a, c2] + won[b, c2])
+                            else:
+                                u = 0.5 * (arrive[1, a, w2, c2, g, l] + arrive[1, b, w2, c2, g, l])
+                                s = 0.5 * (arrive[2, a, w2, c2, g, l] + arrive[2, b, w2, c2, g, l])
+                            policy[t, p, w, c, g, l] = chosen
+                            value[now, p, w, c, g, l] = best
+                            total[now, p, w, c, g, l] = u + extra[chosen]
+                            success[now, p, w, c, g, l] = s
 
 
 @njit(cache=True)
@@ -187,10 +207,10 @@ def follow_policy(rules, tables, policy, start, states, actions):  # type: ignor
         for i in range(6):
             states[w, i] = 0
         states[w, 2] = w
-        states[w, 5] = start
+        states[w, 3] = start
     done = 0
     while done < count:
-        t, p, w, g, l, c = (  # noqa: E741
+        t, p, w, c, g, l = (  # noqa: E741
             states[done, 0],
             states[done, 1],
             states[done, 2],
@@ -198,7 +218,7 @@ def follow_policy(rules, tables, policy, start, states, actions):  # type: ignor
             states[done, 4],
             states[done, 5],
         )
-        chosen = policy[t, p, w, g, l, c]
+        chosen = policy[t, p, w, c, g, l]
         actions[done] = chosen
         done += 1
         if rules[R_ROBOT_REST] > 0 and (t + 1) % rules[R_ROBOT_REST] == 0:
@@ -217,10 +237,10 @@ def follow_policy(rules, tables, policy, start, states, actions):  # type: ignor
             ended = won[after, to] or lost >= rules[R_MAX_LOST]
             if ended or (far[after, to] and at_goal[after] and stood > patience):
                 continue
-            if seen[after, w2, stood, lost, to] == t + 1 or count >= states.shape[0]:
+            if seen[after, w2, to, stood, lost] == t + 1 or count >= states.shape[0]:
                 continue
-            seen[after, w2, stood, lost, to] = t + 1
+            seen[after, w2, to, stood, lost] = t + 1
             states[count, 0], states[count, 1], states[count, 2] = t + 1, after, w2
-            states[count, 3], states[count, 4], states[count, 5] = stood, lost, to
+            states[count, 3], states[count, 4], states[count, 5] = to, stood, lost
             count += 1
     return count

@@ -68,9 +68,7 @@ def _walls(size: int, vertical: list[int], horizontal: list[int]) -> NDArray[np.
     return grid
 
 
-def _openings(
-    order: tuple[bool, ...], limits_x: list[int], limits_y: list[int]
-) -> list[list[tuple[int, int]]]:
+def _openings(order: tuple[bool, ...], limits_x: list[int], limits_y: list[int]) -> list[list[tuple[int, int]]]:
     """Cells that each step of a path from room to room may open; True is a step to the right."""
     choices, i, j = [], 0, 0
     for to_the_right in order:

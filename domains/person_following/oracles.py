@@ -37,9 +37,9 @@ from domains.person_following.world import (
     PLAN_LENGTH,
     TIME,
     WAITING,
+    World,
     X,
     Y,
-    World,
 )
 
 _ROBOT_START = (1, 1, 0)
@@ -61,12 +61,11 @@ class _Solved:
         self.route_length = chain.route_length
         self.goal = tuple(int(v) for v in np.argwhere(chain.grid == GOAL)[0])
         self.actions = {
-            tuple(state): int(action)
-            for state, action in zip(states[:count].tolist(), actions[:count], strict=True)
+            tuple(state): int(action) for state, action in zip(states[:count].tolist(), actions[:count], strict=True)
         }
 
     def state_of(self, world: World, parameters: Parameters, b: int) -> tuple[int, ...]:
-        """(t, p, w, g, l, c) of environment b."""
+        """(t, p, w, c, g, l) of environment b."""
         robot, person = world.robot[b].tolist(), world.person[b].tolist()
         at, length = person[PLAN_AT], person[PLAN_LENGTH]
         if (person[X], person[Y]) != self.goal:
@@ -80,9 +79,9 @@ class _Solved:
             robot[TIME],
             person_state,
             person[WAITING] if parameters.look_back else 0,
+            int(self.pose_index[robot[X], robot[Y], robot[HEADING]]),
             min(robot[AT_GOAL], parameters.goal_patience + 1),
             robot[LOST],
-            int(self.pose_index[robot[X], robot[Y], robot[HEADING]]),
         )
 
 
@@ -140,7 +139,7 @@ def full_state_optimum(
         chain = person_chain(grid, _PERSON_START, parameters)
         policy, *tables = _sweep(chain, parameters, discount)
         start = chain.pose_index[_ROBOT_START]
-        values[m], returns[m], successes[m] = (table[0, 0, 0, 0, 0, start] for table in tables)
+        values[m], returns[m], successes[m] = (table[0, 0, 0, start, 0, 0] for table in tables)
         solved.append(_Solved(chain, parameters, policy))
     return OracleResult(
         value=float(values @ weights),
@@ -158,12 +157,12 @@ def full_state_optimum(
 def _sweep(
     chain: PersonChain, parameters: Parameters, discount: float
 ) -> tuple[NDArray[np.int8], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Policy [T, P, W, G, L, C], and tables of which [0] is t = 0: value, undiscounted return, success."""
+    """Policy [T, P, W, C, G, L], and tables of which [0] is t = 0: value, undiscounted return, success."""
     people, poses = chain.distance.shape
     waits = 3 if parameters.look_back else 1
-    shape = (people, waits, parameters.goal_patience + 2, parameters.max_lost, poses)
+    shape = (people, waits, poses, parameters.goal_patience + 2, parameters.max_lost)
     rules = parameters.rules(following=True)
-    reached = np.zeros((parameters.max_steps, people), np.bool_)
+    reached = np.zeros((parameters.max_steps, people, waits), np.bool_)
     reachable_states(rules, chain.successors, reached)
     # Most of these entries are never touched, so they are reserved and not cleared.
     policy = np.empty((parameters.max_steps, *shape), np.int8)

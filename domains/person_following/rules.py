@@ -201,9 +201,7 @@ def _gap(world, store, b):  # type: ignore[no-untyped-def]
 def _configure(rules, world, view, b):  # type: ignore[no-untyped-def]
     """The person's configuration in the robot's view."""
     robot, person = world.robot[b], world.person[b]
-    side, ahead, heading = relative(
-        robot[X], robot[Y], robot[HEADING], person[X], person[Y], person[HEADING]
-    )
+    side, ahead, heading = relative(robot[X], robot[Y], robot[HEADING], person[X], person[Y], person[HEADING])
     return configuration_of(view, side, ahead, heading, rules[R_SEE_THROUGH])
 
 
@@ -218,9 +216,7 @@ def _step_crossing(rules, world, out, b, action):  # type: ignore[no-untyped-def
     out.outcome[b] = SUCCESS if entered else (TIMEOUT if out.truncated[b] else 0)
     out.distance[b], out.visible[b], out.person_action[b] = 0, False, NO_ACTION
     out.final_configuration[b] = 0
-    look(
-        world.grid[b], robot[X], robot[Y], robot[HEADING], rules[R_SEE_THROUGH] != 0, out.final_view[b]
-    )
+    look(world.grid[b], robot[X], robot[Y], robot[HEADING], rules[R_SEE_THROUGH] != 0, out.final_view[b])
 
 
 @njit(cache=True)
@@ -307,9 +303,7 @@ def _describe(rules, world, b, view, pose, counters):  # type: ignore[no-untyped
     """Fill the person's view, its pose relative to the robot, and the counters."""
     robot, person = world.robot[b], world.person[b]
     look(world.grid[b], person[X], person[Y], person[HEADING], rules[R_SEE_THROUGH] != 0, view)
-    pose[0], pose[1], pose[2] = relative(
-        robot[X], robot[Y], robot[HEADING], person[X], person[Y], person[HEADING]
-    )
+    pose[0], pose[1], pose[2] = relative(robot[X], robot[Y], robot[HEADING], person[X], person[Y], person[HEADING])
     counters[0], counters[1] = person[WAITING], robot[LOST]
 
 
@@ -334,9 +328,7 @@ def step_batch(rules, world, store, maps, actions, autoreset, out):  # type: ign
         world.robot[b, TIME] += 1
         if following:
             _step_following(rules, world, store, out, b, actions[b])
-            _describe(
-                rules, world, b, out.final_person_view[b], out.final_pose[b], out.final_counters[b]
-            )
+            _describe(rules, world, b, out.final_person_view[b], out.final_pose[b], out.final_counters[b])
         else:
             _step_crossing(rules, world, out, b, actions[b])
         if autoreset and (out.terminated[b] or out.truncated[b]):

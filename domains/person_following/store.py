@@ -173,9 +173,7 @@ def distance(store, grid, slot, x, y, heading, to_x, to_y, to_heading):  # type:
     if row >= 0:
         return np.int64(store.distance[row, pose])
     compare = _compared(store, to_heading)
-    return np.int64(
-        distance_field(grid, to_x, to_y, to_heading, compare, pose, store.distance[0, :0], store.scratch)
-    )
+    return np.int64(distance_field(grid, to_x, to_y, to_heading, compare, pose, store.distance[0, :0], store.scratch))
 
 
 @njit(cache=True)

@@ -92,9 +92,7 @@ class Parameters:
             raise DomainError(f"size must be odd and in 5..{MAX_SIZE}, got {self.size}")
         feasible = self.size - 3
         if not 0 <= self.num_crossings <= feasible:
-            raise DomainError(
-                f"num_crossings must be in 0..{feasible} for size {self.size}, got {self.num_crossings}"
-            )
+            raise DomainError(f"num_crossings must be in 0..{feasible} for size {self.size}, got {self.num_crossings}")
         if self.view_size % 2 == 0 or not 3 <= self.view_size <= 15:
             raise DomainError(f"view_size must be odd and in 3..15, got {self.view_size}")
         for name in ("max_steps", "max_lost"):

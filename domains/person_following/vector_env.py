@@ -128,18 +128,14 @@ class Batch:
         if grid is not None:
             self.world.grid[:] = grid
         everywhere = np.ones(self.num_envs, np.bool_)
-        kernel.begin_batch(
-            self.rules, self.world, self.store, self.maps, everywhere, grid is not None, self.last
-        )
+        kernel.begin_batch(self.rules, self.world, self.store, self.maps, everywhere, grid is not None, self.last)
         if waiting is not None:
             self.world.person[:, WAITING] = waiting
 
     def step(self, actions: NDArray[np.int64], autoreset: bool) -> None:
         """Take a step everywhere; the results lie in `last`, which is new every time."""
         self.last = allocate_results(self.num_envs, self.parameters.view_size)
-        kernel.step_batch(
-            self.rules, self.world, self.store, self.maps, actions, autoreset, self.last
-        )
+        kernel.step_batch(self.rules, self.world, self.store, self.maps, actions, autoreset, self.last)
 
     def describe(self) -> tuple[NDArray[np.uint8], NDArray[np.int16], NDArray[np.int16]]:
         """Person views, relative poses and counters of the present states; crossing has no person."""
@@ -290,9 +286,7 @@ class PersonFollowingVectorEnv(VectorEnv):  # type: ignore[misc]
 
     def step(
         self, actions: Any
-    ) -> tuple[
-        dict[str, NDArray[Any]], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
-    ]:
+    ) -> tuple[dict[str, NDArray[Any]], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """Take one action per environment; where an episode ends, the next begins in the same step."""
         if not self._begun:
             raise gymnasium.error.ResetNeeded("call reset() before step()")

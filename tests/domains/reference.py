@@ -1,0 +1,245 @@
+"""The person-following task in slow plain Python, written from the task's description alone.
+
+Every rule is spelled out once more here, with dictionaries, lists and Python's own heapq, so that the compiled
+rules can be held against it step by step.
+"""
+
+from __future__ import annotations
+
+import heapq
+
+import numpy as np
+
+STEPS = {0: (1, 0), 1: (0, 1), 2: (-1, 0), 3: (0, -1)}
+LEFT, RIGHT, FORWARD, STAY = 0, 1, 2, 3
+
+
+def astar(grid, start, goal, goal_heading, compare):
+    """The A* of the task: actions from `start` (x, y, heading) to the cell `goal`, or None."""
+
+    def heuristic(x, y, h):
+        value = abs(x - goal[0]) + abs(y - goal[1])
+        if goal_heading is not None:
+            difference = abs(h - goal_heading)
+            value += 0.5 * min(difference, 4 - difference)
+        return value
+
+    open_heap = [(heuristic(*start), *start)]
+    cost = {start: 0}
+    came = {start: None}
+    while open_heap:
+        _, x, y, h = heapq.heappop(open_heap)
+        node = (x, y, h)
+        if (x, y) == goal and (not compare or h == goal_heading):
+            actions = []
+            while came[node] is not None:
+                node, action = came[node]
+                actions.append(action)
+            return actions[::-1]
+        forward = (x + STEPS[h][0], y + STEPS[h][1], h)
+        for action, following in ((LEFT, (x, y, (h - 1) % 4)), (RIGHT, (x, y, (h + 1) % 4)), (FORWARD, forward)):
+            if not (0 <= following[0] < len(grid) and 0 <= following[1] < len(grid)):
+                continue
+            if grid[following[0]][following[1]] == 1:
+                continue
+            new_cost = cost[node] + 1
+            if following not in cost or new_cost < cost[following]:
+                cost[following] = new_cost
+                came[following] = (node, action)
+                heapq.heappush(open_heap, (new_cost + heuristic(*following), *following))
+    return None
+
+
+def view_of(grid, pose, view_size, see_through_walls):
+    """Cell kinds seen from a pose, as a list of columns [vx][vy]."""
+    x, y, h = pose
+    fx, fy = STEPS[h]
+    rx, ry = STEPS[(h + 1) % 4]
+    view = [[1] * view_size for _ in range(view_size)]
+    for vx in range(view_size):
+        for vy in range(view_size):
+            side, ahead = vx - view_size // 2, view_size - 1 - vy
+            cx, cy = x + ahead * fx + side * rx, y + ahead * fy + side * ry
+            if 0 <= cx < len(grid) and 0 <= cy < len(grid):
+                view[vx][vy] = int(grid[cx][cy])
+    if not see_through_walls:
+        mask = visible_mask(view, view_size)
+        for vx in range(view_size):
+            for vy in range(view_size):
+                if not mask[vx][vy]:
+                    view[vx][vy] = 3
+    view[view_size // 2][view_size - 1] = 0
+    return view
+
+
+def visible_mask(view, n):
+    """Minigrid's Grid.process_vis for a viewer in the middle of the last row."""
+    mask = [[False] * n for _ in range(n)]
+    mask[n // 2][n - 1] = True
+    for j in reversed(range(n)):
+        for i in range(n - 1):
+            if mask[i][j] and view[i][j] != 1:
+                mask[i + 1][j] = True
+                if j > 0:
+                    mask[i + 1][j - 1] = True
+                    mask[i][j - 1] = True
+        for i in reversed(range(1, n)):
+            if mask[i][j] and view[i][j] != 1:
+                mask[i - 1][j] = True
+                if j > 0:
+                    mask[i - 1][j - 1] = True
+                    mask[i][j - 1] = True
+    return mask
+
+
+class Reference:
+    """One environment; `random_turn` supplies the person's draws at its goal (0 left, 1 right)."""
+
+    def __init__(
+        self,
+        random_turn,
+        view_size=5,
+        see_through_walls=True,
+        max_steps=200,
+        follow_distance=3,
+        max_lost=3,
+        look_back=True,
+        person_rest=0,
+        robot_rest=0,
+        goal_patience=0,
+        compare_heading="unless-0",
+        keep_waiting=True,
+    ):
+        self.__dict__.update({k: v for k, v in locals().items() if k != "self"})
+        self.waiting = 0
+
+    def reset(self, grid, waiting=None, person=(2, 2, 0)):
+        self.grid = [[int(cell) for cell in column] for column in grid]
+        self.goal = next((x, y) for x, column in enumerate(self.grid) for y, c in enumerate(column) if c == 2)
+        self.agent = (1, 1, 0)
+        self.person = person
+        self.grid[person[0]][person[1]] = 0
+        if not self.keep_waiting:
+            self.waiting = 0
+        if waiting is not None:
+            self.waiting = waiting
+        self.t = self.lost = self.at_goal = 0
+        self.plan = astar(self.grid, self.person, self.goal, None, False) or []
+        return self.observe()
+
+    def distance(self):
+        heading = self.person[2]
+        compare = {"always": True, "never": False, "unless-0": heading != 0}[self.compare_heading]
+        in_heuristic = None if self.compare_heading == "never" else heading
+        path = astar(self.grid, self.agent, self.person[:2], in_heuristic, compare)
+        return 0 if path is None else len(path)
+
+    def relative(self):
+        """(side, ahead, heading) of the person."""
+        fx, fy = STEPS[self.agent[2]]
+        rx, ry = STEPS[(self.agent[2] + 1) % 4]
+        dx, dy = self.person[0] - self.agent[0], self.person[1] - self.agent[1]
+        return dx * rx + dy * ry, dx * fx + dy * fy, (self.person[2] - self.agent[2] - 1) % 4
+
+    def configuration(self):
+        side, ahead, heading = self.relative()
+        half = self.view_size // 2
+        if not (-half <= side <= half and 0 <= ahead < self.view_size) or (side, ahead) == (0, 0):
+            return 0
+        vx, vy = half + side, self.view_size - 1 - ahead
+        if view_of(self.grid, self.agent, self.view_size, self.see_through_walls)[vx][vy] == 3:
+            return 0
+        return 1 + (vx * self.view_size + vy) * 4 + heading
+
+    def observe(self):
+        return view_of(self.grid, self.agent, self.view_size, self.see_through_walls), self.configuration()
+
+    def person_view(self):
+        return view_of(self.grid, self.person, self.view_size, self.see_through_walls)
+
+    def greedy(self):
+        """First action of the A* path to the person's pose; stay when there."""
+        heading = self.person[2]
+        compare = {"always": True, "never": False, "unless-0": heading != 0}[self.compare_heading]
+        in_heuristic = None if self.compare_heading == "never" else heading
+        path = astar(self.grid, self.agent, self.person[:2], in_heuristic, compare)
+        return path[0] if path else STAY
+
+    def step(self, action):
+        """(observation, reward, terminated, truncated, outcome, person's action)."""
+        self.t += 1
+        if self.robot_rest and self.t % self.robot_rest == 0:
+            action = STAY
+        x, y, h = self.agent
+        entered = False
+        if action == LEFT:
+            self.agent = (x, y, (h - 1) % 4)
+        elif action == RIGHT:
+            self.agent = (x, y, (h + 1) % 4)
+        elif action == FORWARD:
+            nx, ny = x + STEPS[h][0], y + STEPS[h][1]
+            if self.grid[nx][ny] != 1 and (nx, ny) != self.person[:2]:
+                self.agent = (nx, ny, h)
+                entered = self.grid[nx][ny] == 2
+        reward = 1 - 0.9 * (self.t / self.max_steps) if entered else 0.0
+
+        did = self.person_step()
+
+        d, sees = self.distance(), self.configuration() != 0
+        at_goal = self.person[:2] == self.goal
+        self.at_goal += at_goal
+        front = (self.agent[0] + STEPS[self.agent[2]][0], self.agent[1] + STEPS[self.agent[2]][1])
+        if action == FORWARD and self.person[:2] == front:
+            reward -= 0.01
+        if self.person[:2] == self.agent[:2]:
+            reward -= 0.01
+        success = lost = unescorted = False
+        if d <= self.follow_distance:
+            self.lost = 0
+            if d > 0:
+                reward += 1.5 / (1 + d)
+            if sees:
+                reward += 0.5
+            if at_goal and sees:
+                reward += 100
+                success = True
+        else:
+            self.lost += 1
+            reward -= 0.05 * d
+            lost = self.lost >= self.max_lost
+            unescorted = at_goal and self.at_goal > self.goal_patience
+        timeout = self.t >= self.max_steps
+        outcomes = (
+            ("success", success),
+            ("agent_at_goal", entered),
+            ("lost", lost),
+            ("unescorted", unescorted),
+            ("timeout", timeout),
+        )
+        outcome = next((name for name, holds in outcomes if holds), "")
+        return self.observe(), reward, success or entered, lost or unescorted or timeout, outcome, did
+
+    def person_step(self):
+        if self.person_rest and self.t % self.person_rest == 0:
+            return STAY
+        if self.look_back and (self.configuration() == 0 or self.distance() > self.follow_distance):
+            self.waiting += 1
+            if self.waiting < 3:
+                return STAY
+        self.waiting = 0
+        if not self.plan:
+            self.plan = astar(self.grid, self.person, self.goal, None, False) or [self.random_turn()] * 2
+        action = self.plan.pop(0)
+        x, y, h = self.person
+        if action == LEFT:
+            self.person = (x, y, (h - 1) % 4)
+        elif action == RIGHT:
+            self.person = (x, y, (h + 1) % 4)
+        else:
+            self.person = (x + STEPS[h][0], y + STEPS[h][1], h)
+        return action
+
+
+def plain_grid(kernel_grid):
+    """A grid array as nested lists of ints."""
+    return np.asarray(kernel_grid).tolist()

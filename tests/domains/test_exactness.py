@@ -1,0 +1,100 @@
+"""The compiled rules against a plain reference and against Minigrid, step by step."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+from minigrid.core.world_object import Wall
+from minigrid.envs.crossing import CrossingEnv
+
+import domains  # noqa: F401
+from domains.person_following.map_generation import generate_crossing
+from domains.person_following.random_numbers import seeded_stream, stream_of, write_back
+from tests.domains.play import compare_play
+from tests.domains.reference import Reference
+
+STEPS = 1500
+
+
+@pytest.mark.parametrize("player", ["random", "greedy", "mixed", "adversarial"])
+def test_paper_equals_the_reference(player):
+    env = gymnasium.make("nesy/PersonFollowing-v0")
+    outcomes = compare_play(env, Reference(None), player, STEPS, seed=7)
+    assert sum(outcomes.values()) > 20
+    if player == "greedy":
+        assert outcomes["success"] > 10
+    if player == "adversarial":
+        assert outcomes.get("agent_at_goal", 0) + outcomes.get("success", 0) > 0
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"size": 13, "num_crossings": 3},
+        {"size": 7, "num_crossings": 2, "view_size": 7, "compare_heading": "always"},
+        {"size": 9, "num_crossings": 3, "see_through_walls": False, "look_back": False, "max_steps": 23},
+        {"compare_heading": "never", "keep_waiting": False, "person_rest": 4, "robot_rest": 5, "max_lost": 8},
+        {"goal_patience": 4, "follow_distance": 2, "view_size": 3, "max_lost": 20},
+    ],
+)
+def test_changed_rules_equal_the_reference(changes):
+    env = gymnasium.make("nesy/PersonFollowing-v0", **changes)
+    rules = {k: v for k, v in changes.items() if k not in ("size", "num_crossings")}
+    compare_play(env, Reference(None, **rules), "mixed", STEPS // 2, seed=3)
+    compare_play(env, Reference(None, **rules), "adversarial", STEPS // 2, seed=4)
+
+
+@pytest.mark.parametrize(("size", "crossings"), [(5, 1), (5, 2), (9, 0), (9, 1), (9, 2), (9, 6), (13, 3), (31, 9)])
+def test_maps_equal_minigrid(size, crossings):
+    original = CrossingEnv(size=size, num_crossings=crossings, obstacle_type=Wall)
+    grid = np.zeros((size, size), np.uint8)
+    kinds = np.zeros(11, np.uint8)
+    kinds[[1, 2, 8]] = 0, 1, 2
+    for seed in range(25):
+        original.reset(seed=seed)
+        stream = seeded_stream(seed)
+        for _ in range(3):
+            generate_crossing(stream, grid, crossings)
+            assert (kinds[original.grid.encode()[:, :, 0]] == grid).all()
+            original.reset()
+
+
+def test_crossing_steps_equal_minigrid():
+    original = CrossingEnv(size=9, num_crossings=2, obstacle_type=Wall, agent_view_size=5)
+    env = gymnasium.make("nesy/Crossing-v0", size=9, num_crossings=2, see_through_walls=False)
+    kinds = np.zeros(11, np.uint8)
+    kinds[[0, 1, 2, 8]] = 3, 0, 1, 2
+    rng = np.random.default_rng(0)
+    ended = 0
+    for episode in range(30):
+        first, _ = original.reset(seed=episode)
+        observation, _ = env.reset(seed=episode)
+        done = False
+        while not done:
+            assert (kinds[first["image"][:, :, 0]] == observation["view"]).all()
+            assert observation["configuration"] == 0
+            state = env.unwrapped.state()
+            assert state["agent"] == (*original.agent_pos, original.agent_dir)
+            expert = env.unwrapped.expert_action("goal")
+            action = int(rng.integers(4)) if rng.random() < 0.6 else expert
+            first, r, te, tr, _ = original.step(action)
+            observation, reward, terminated, truncated, info = env.step(action)
+            assert (r, te, tr) == (pytest.approx(reward), terminated, truncated)
+            done = te or tr
+        ended += info["outcome"] == "success"
+    assert ended > 10
+
+
+def test_random_stream_goes_on_where_numpy_stands():
+    generator = np.random.default_rng(5)
+    generator.integers(7)
+    stream = stream_of(generator)
+    grid = np.zeros((9, 9), np.uint8)
+    generate_crossing(stream, grid, 2)
+    other = np.random.default_rng(0)
+    write_back(stream, other)
+    again = stream_of(other)
+    assert (again == stream).all()
+    with pytest.raises(ValueError, match="PCG64"):
+        stream_of(np.random.Generator(np.random.MT19937(0)))
