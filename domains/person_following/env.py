@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -10,18 +10,18 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from domains.core import OUTCOMES, ViewGeometry
+from domains.person_following.batch import NUM_ACTIONS, Batch, checked_actions, observation_space
 from domains.person_following.random_numbers import stream_of, write_back
-from domains.person_following.vector_env import NUM_ACTIONS, Batch, checked_actions, observation_space
 
 
-class PersonFollowingEnv(gymnasium.Env):  # type: ignore[misc]
+class PersonFollowingEnv(gymnasium.Env):
     """One environment of the person-following or the crossing task.
 
     Observation: `view` uint8 [v, v] of cell kinds indexed [vx, vy], the person removed, and `configuration`,
     0 where the person is unseen. Actions: left, right, forward, stay.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": [], "render_fps": 6}
+    metadata: dict[str, Any] = {"render_modes": [], "render_fps": 6}  # noqa: RUF012
 
     def __init__(
         self,
@@ -82,7 +82,7 @@ class PersonFollowingEnv(gymnasium.Env):  # type: ignore[misc]
             self._actions[:] = checked_actions(np.asarray(action).reshape(-1), 1)
         self.batch.step(self._actions, False)
         last = self.batch.last
-        info = {
+        info: dict[str, Any] = {
             "distance": int(last.distance[0]),
             "visible": bool(last.visible[0]),
             "person_action": int(last.person_action[0]),

@@ -96,8 +96,11 @@ def astar(grid, x, y, heading, goal_x, goal_y, goal_heading, compare, scratch): 
 
     Args:
         grid: cell kinds [size, size].
-        x, y, heading: the start.
-        goal_x, goal_y: the target cell.
+        x: of the start.
+        y: of the start.
+        heading: of the start.
+        goal_x: of the target cell.
+        goal_y: of the target cell.
         goal_heading: heading that enters the heuristic; -1 for none.
         compare: whether the path must end in `goal_heading`.
         scratch: working memory for this size.
@@ -162,7 +165,9 @@ def distance_field(grid, x, y, heading, compare, until, distances, scratch):  # 
 
     Args:
         grid: cell kinds [size, size].
-        x, y, heading: the target pose.
+        x: of the target pose.
+        y: of the target pose.
+        heading: of the target pose.
         compare: whether the final heading must be the target's.
         until: stop as soon as this pose is reached; -1 to reach all.
         distances: int16 [poses] to fill with distances (NO_PATH where none), or an empty array.
