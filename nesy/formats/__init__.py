@@ -29,6 +29,11 @@ FORMATS: dict[str, Format] = {
     "native": Format("native", "", True, "a folder with model.json and tables.npz; bit-equal when read back"),
     "parquet": Format("parquet", ".parquet", True, "one row per action, factor, parents' values and value"),
     "csv": Format("csv_table", ".csv", False, "the same as text"),
+    "jgum": Format("jgum", ".jgum", True, "pyAgrum: one Bayesian network, a copy of slice t+1 per action; bit-equal"),
+    "bif": Format("bif", ".bif", False, "the same for any Bayesian network tool, nine digits"),
+    "prism": Format("prism", ".prism", False, "Storm and PRISM: one module per factor, synchronised on the action"),
+    "graphml": Format("graphml", ".graphml", False, "the graph for Gephi, yEd and networkx"),
+    "dot": Format("dot", ".dot", False, "the graph for Graphviz"),
     "asp": Format("asp_facts", ".lp", False, "facts for clingo (vocabulary: docs/asp.md)"),
 }
 

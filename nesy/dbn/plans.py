@@ -1,0 +1,102 @@
+"""What happens along a plan: what it depends on, and the exact distribution over codes.
+
+For models with impossible transitions the reachable codes are few, and a forward pass over them is exact where
+elimination would need a table over all factors. `pruned` makes such a model out of one that rules nothing out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from nesy.dbn.inference import ancestors
+from nesy.dbn.model import TwoSliceDBN
+from nesy.errors import UserError
+
+MAX_CODES = 1 << 21
+
+
+def cone(dbn: TwoSliceDBN, plan: Sequence[int], factors: Sequence[int]) -> list[tuple[int, ...]]:
+    """Cone of influence: the factors of every slice 0..T that the given factors of slice T depend on."""
+    needed: list[set[int]] = [set() for _ in range(len(plan) + 1)]
+    needed[-1] = set(factors)
+    for step in range(len(plan), 0, -1):
+        action = plan[step - 1]
+        needed[step] = set(ancestors(dbn, action, tuple(needed[step])))
+        needed[step - 1] = {p for i in needed[step] for p in dbn.parents_now[action][i]}
+    return [tuple(sorted(slice_)) for slice_ in needed]
+
+
+def follow(
+    dbn: TwoSliceDBN, code: np.ndarray, plan: Sequence[int], factors: Sequence[int] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Exact distribution over the codes that a plan can lead to.
+
+    Args:
+        dbn: the model.
+        code: integers [N], where the plan starts.
+        plan: the actions.
+        factors: the factors asked for; only what they depend on is followed, other entries of the codes are 0.
+            All by default.
+
+    Returns:
+        uint8 [M, N], each once, and their probabilities float64 [M].
+
+    Raises:
+        UserError: more than 2 million codes are reachable.
+    """
+    needed = cone(dbn, plan, range(dbn.num_factors) if factors is None else factors)
+    keep = np.zeros(dbn.num_factors, dtype=bool)
+    keep[list(needed[0])] = True
+    codes = np.where(keep, dbn._codes(code), 0)[None]
+    weights = np.ones(1)
+    for step, action in enumerate(plan):
+        codes, weights = _step(dbn, codes, weights, int(action), needed[step + 1])
+    return codes.astype(np.uint8), weights
+
+
+def _step(
+    dbn: TwoSliceDBN, codes: np.ndarray, weights: np.ndarray, action: int, factors: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    now, later = codes, np.zeros_like(codes)
+    # factors of slice t are dropped as soon as nobody asks for them any more, so that codes merge early
+    order = [i for i in dbn.order if i in factors]
+    for position, i in enumerate(order):
+        table = dbn.cpt(action, i)[dbn.rows(action, i, now, later)] * weights[:, None]
+        source, values = np.nonzero(table)
+        now, later, weights = now[source], later[source], table[source, values]
+        later[:, i] = values
+        waiting = order[position + 1 :]
+        still = {p for j in waiting for p in dbn.parents_now[action][j]}
+        now[:, [p for p in range(dbn.num_factors) if p not in still]] = 0
+        now, later, weights = _merged(now, later, weights, dbn.num_values)
+        if len(weights) > MAX_CODES:
+            raise UserError("more than 2 million codes are reachable; prune the model or ask for fewer factors")
+    return later, weights
+
+
+def _merged(
+    now: np.ndarray, later: np.ndarray, weights: np.ndarray, num_values: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    both = np.column_stack([now, later]).astype(np.uint8)
+    keys = np.ascontiguousarray(both).view(np.dtype((np.void, both.shape[1]))).reshape(-1)
+    _, first, index = np.unique(keys, return_index=True, return_inverse=True)
+    return now[first], later[first], np.bincount(index.reshape(-1), weights)
+
+
+def pruned(dbn: TwoSliceDBN, least: float) -> tuple[TwoSliceDBN, float]:
+    """The model without values less probable than `least`, its rows renormalised.
+
+    Returns:
+        The model, and the largest probability mass that a row has lost.
+
+    Raises:
+        UserError: `least` would empty a row.
+    """
+    if not 0 <= least < 1.0 / dbn.num_values:
+        raise UserError(f"the least probability must lie in [0, 1/{dbn.num_values}), found {least}")
+    kept = np.where(dbn.probabilities >= least, dbn.probabilities, 0.0)
+    totals = kept.sum(axis=1, keepdims=True)
+    return replace(dbn, probabilities=kept / totals), float(1.0 - totals.min())

@@ -1,0 +1,35 @@
+"""BIF, the interchange format of Bayesian networks: as jgum, with probabilities to nine digits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from nesy.dbn.model import TwoSliceDBN
+from nesy.formats.bayes_nodes import nodes
+from nesy.run_folder import atomic_path
+
+
+def write(dbn: TwoSliceDBN, path: Path) -> None:
+    """Write `dbn` to the file `path`."""
+    k = dbn.num_values
+    values = ", ".join(map(str, range(k)))
+    every = list(nodes(dbn))
+    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as stream:
+        stream.write("network dbn { }\n")
+        for node in every:
+            stream.write(f"variable {node.name} {{ type discrete [ {k} ] {{ {values} }}; }}\n")
+        for node in every:
+            if not node.parents:
+                stream.write(f"probability ( {node.name} ) {{ table {_numbers(node.tensor)}; }}\n")
+                continue
+            stream.write(f"probability ( {node.name} | {', '.join(node.parents)} ) {{\n")
+            table = node.tensor.reshape(-1, k)
+            for context, row in zip(np.ndindex(*node.tensor.shape[:-1]), table, strict=True):
+                stream.write(f"  ({', '.join(map(str, context))}) {_numbers(row)};\n")
+            stream.write("}\n")
+
+
+def _numbers(row: np.ndarray) -> str:
+    return ", ".join(f"{p:.9g}" for p in row.tolist())

@@ -1,0 +1,17 @@
+"""GraphML: the graph of the 2DBN without its tables, for Gephi, yEd and networkx."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import networkx
+
+from nesy.dbn.graph import to_networkx
+from nesy.dbn.model import TwoSliceDBN
+from nesy.run_folder import atomic_path
+
+
+def write(dbn: TwoSliceDBN, path: Path) -> None:
+    """Write the graph as GraphML; edges carry `action` and `strength`."""
+    with atomic_path(path) as temporary:
+        networkx.write(to_networkx(dbn), temporary)

@@ -1,0 +1,123 @@
+"""jgum, pyAgrum's JSON format: one Bayesian network with a copy of slice t+1 per action; bit-equal when read back.
+
+Written and read here without pyAgrum, which the core does not need.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nesy.dbn.model import TwoSliceDBN
+from nesy.errors import UserError
+from nesy.formats.bayes_nodes import node_names, nodes
+from nesy.run_folder import atomic_path, read_json
+
+PROPERTY = "nesy-2dbn"
+
+
+def write(dbn: TwoSliceDBN, path: Path) -> None:
+    """Write `dbn` to the file `path`."""
+    names: list[str] = []
+    parents: dict[str, list[str]] = {}
+    tables: dict[str, str] = {}
+    for node in nodes(dbn):
+        names.append(f"{node.name}[{dbn.num_values}]")
+        parents[node.name] = list(node.parents)
+        # pyAgrum's order: the node's own value runs fastest, then its first parent, ...
+        axes = (*range(len(node.parents) - 1, -1, -1), len(node.parents))
+        tables[node.name] = json.dumps(node.tensor.transpose(axes).reshape(-1).tolist())
+    met = np.flatnonzero(dbn.row_counts)
+    document = {
+        "factor_names": dbn.factor_names,
+        "action_names": dbn.action_names,
+        "num_values": dbn.num_values,
+        "order": dbn.order,
+        "parents_now": dbn.parents_now,
+        "parents_next": dbn.parents_next,
+        "value_meanings": dbn.value_meanings,
+        "provenance": dbn.provenance,
+        "met": [met.tolist(), dbn.row_counts[met].tolist()],
+        "tables": {name: {"dtype": t.dtype.str, "values": t.tolist()} for name, t in dbn.tables.items()},
+    }
+    properties = {"name": "2DBN", "software": "nesy", PROPERTY: json.dumps(document)}
+    head = {"type": "BN", "GumJsonVersion": "1.0", "nodes": names, "parents": parents}
+    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as stream:
+        stream.write(json.dumps(head)[:-1] + ', "cpt": {')
+        stream.write(", ".join(f"{json.dumps(name)}: {table}" for name, table in tables.items()))
+        stream.write('}, "properties": ' + json.dumps(properties) + "}\n")
+
+
+def read(path: Path) -> TwoSliceDBN:
+    """Read the file `path`, as `write` made it.
+
+    Raises:
+        UserError: it is damaged or holds another network.
+    """
+    content = read_json(path)
+    try:
+        document = json.loads(content["properties"][PROPERTY])
+    except (KeyError, TypeError, ValueError, RecursionError):
+        raise UserError(f"{path}: not a jgum file of a 2DBN (its property '{PROPERTY}' is missing)") from None
+    try:
+        return _build(document, content)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from None
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+        raise UserError(f"{path}: not a readable jgum file of a 2DBN ({error!r})") from None
+
+
+def _build(document: dict[str, Any], content: dict[str, Any]) -> TwoSliceDBN:
+    # an empty shell first: it checks the structure before any table is looked for
+    k = int(document["num_values"])
+    now, later = _tuples(document["parents_now"]), _tuples(document["parents_next"])
+    factors, actions = _tuples(document["factor_names"]), _tuples(document["action_names"])
+    tables: list[list[np.ndarray]] = []
+    shell = TwoSliceDBN.from_tables(
+        [[np.full((1, k), 1.0 / k)] * len(factors)] * len(actions),
+        [[()] * len(factors)] * len(actions),
+        factor_names=factors,
+        action_names=actions,
+    )
+    names_now, names_later = node_names(shell)
+    for a, names in enumerate(names_later):
+        tables.append([])
+        for i, name in enumerate(names):
+            arity = len(now[a][i]) + len(later[a][i])
+            own = [(names_now, names)[where][p] for where, p in _pairs(now[a][i], later[a][i])]
+            if content["parents"][name] != own:
+                raise UserError(f"the parents of {name} are not those of the 2DBN")
+            flat = np.array(content["cpt"][name], dtype=np.float64).reshape((k,) * (arity + 1))
+            axes = (*range(arity - 1, -1, -1), arity)
+            tables[-1].append(flat.transpose(axes).reshape(-1, k))
+    met_rows, met_counts = (np.array(column, dtype=np.int64) for column in document["met"])
+    counts = np.zeros(sum(len(t) for ts in tables for t in ts), dtype=np.int64)
+    counts[met_rows] = met_counts
+    return TwoSliceDBN(
+        factor_names=factors,
+        num_values=k,
+        action_names=actions,
+        parents_now=now,
+        parents_next=later,
+        order=_tuples(document["order"]),
+        probabilities=np.concatenate([t for ts in tables for t in ts]),
+        row_counts=counts,
+        initial=np.array([content["cpt"][name] for name in names_now], dtype=np.float64),
+        value_meanings=_tuples(document["value_meanings"]),
+        provenance=dict(document["provenance"]),
+        tables={
+            str(name): np.array(entry["values"], dtype=np.dtype(str(entry["dtype"])))
+            for name, entry in document["tables"].items()
+        },
+    )
+
+
+def _pairs(now: tuple[int, ...], later: tuple[int, ...]) -> list[tuple[int, int]]:
+    return [(0, p) for p in now] + [(1, p) for p in later]
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
