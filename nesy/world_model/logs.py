@@ -27,7 +27,7 @@ class MetricsLog:
         with atomic_path(self.path) as temporary:
             temporary.write_text("".join(line + "\n" for line in lines[:keep]), encoding="utf-8")
         self._stream = self.path.open("a", encoding="utf-8")
-        self._writer = SummaryWriter(str(folder / "tensorboard"), purge_step=keep + 1)  # type: ignore[no-untyped-call]
+        self._writer = SummaryWriter(str(folder / "tensorboard"), purge_step=keep + 1)
 
     def write(self, tick: int, figures: dict[str, Any]) -> None:
         """Append the figures of epoch `tick`, counted from 1."""
@@ -35,7 +35,7 @@ class MetricsLog:
         self._stream.flush()
         for name, value in figures.items():
             if isinstance(value, int | float):
-                self._writer.add_scalar(f"{figures['stage']}/{name}", value, tick)  # type: ignore[no-untyped-call]
+                self._writer.add_scalar(f"{figures['stage']}/{name}", value, tick)
 
     def __enter__(self) -> MetricsLog:
         return self
@@ -44,4 +44,4 @@ class MetricsLog:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stream.close()
-        self._writer.close()  # type: ignore[no-untyped-call]
+        self._writer.close()

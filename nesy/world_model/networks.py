@@ -217,6 +217,8 @@ class SymbolicWorldModel(WorldModel):
         result = torch.empty_like(belief)
         for a in range(self.num_actions):
             for rows in torch.nonzero(action == a).flatten().split(CHUNK):
+                if not len(rows):
+                    continue
                 before = belief[rows]
                 after: dict[int, Tensor] = {}
                 for i in structure.order:

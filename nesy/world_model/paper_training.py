@@ -62,7 +62,7 @@ class PaperTrainer:
             rows = torch.multinomial(self.chances, self.config.batch_size, True, generator=self.generator).numpy()
             parts = self._loss(t.source[rows], t.action[rows], t.target[rows])
             self.optimizer.zero_grad(set_to_none=True)
-            parts["loss"].backward()  # type: ignore[no-untyped-call]
+            parts["loss"].backward()
             self.optimizer.step()
             for name, value in parts.items():
                 totals[name] += float(value.detach()) / STEPS

@@ -6,6 +6,7 @@ A forward model is packed into flat arrays, so that one kernel serves the world 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
@@ -17,9 +18,20 @@ CAPACITY = 4096
 class Factored(Protocol):
     """What can be packed: parents per action and factor, an order, and conditional tables."""
 
-    parents_now: tuple[tuple[tuple[int, ...], ...], ...]
-    parents_next: tuple[tuple[tuple[int, ...], ...], ...]
-    order: tuple[int, ...]
+    @property
+    def parents_now(self) -> tuple[tuple[tuple[int, ...], ...], ...]:
+        """[a][i]: parents in slice t."""
+        ...
+
+    @property
+    def parents_next(self) -> tuple[tuple[tuple[int, ...], ...], ...]:
+        """[a][i]: parents in slice t+1."""
+        ...
+
+    @property
+    def order(self) -> tuple[int, ...]:
+        """The order in which the factors of slice t+1 are decided."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -190,5 +202,5 @@ def successors(
 def most_probable(model: PackedModel, codes: np.ndarray, actions: np.ndarray) -> np.ndarray:
     """The most probable successor of each (code, action): uint8 [S, N]."""
     ends, then, mass = successors(model, codes, actions)
-    best = np.array([first + mass[first:last].argmax() for first, last in zip(ends[:-1], ends[1:], strict=True)])
+    best = np.array([first + mass[first:last].argmax() for first, last in pairwise(ends)])
     return then[best.astype(np.int64)] if len(best) else np.zeros((0, model.num_factors), np.uint8)

@@ -48,6 +48,8 @@ SWEEPS = 2
 class ForwardGuide(nn.Module):
     """Predicts the next code factor by factor, later factors seeing the earlier ones; only used in training."""
 
+    mask: Tensor
+
     def __init__(self, model: SymbolicWorldModel) -> None:
         super().__init__()
         self.sizes = (model.num_factors, model.num_values, model.num_actions)
@@ -164,7 +166,7 @@ class SymbolicTrainer:
         for rows in order[: steps * self.config.batch_size].chunk(steps):
             parts = self._loss(rows.numpy(), noise, temperature)
             self.optimizer.zero_grad(set_to_none=True)
-            parts["loss"].backward()  # type: ignore[no-untyped-call]
+            parts["loss"].backward()
             self.optimizer.step()
             for name, value in parts.items():
                 totals[name] += float(value.detach()) / steps
@@ -229,7 +231,7 @@ class SymbolicTrainer:
             }
             parts["loss"] = parts["code"] + parts["reconstruction"] + parts["inverse"]
             self.optimizer.zero_grad(set_to_none=True)
-            parts["loss"].backward()  # type: ignore[no-untyped-call]
+            parts["loss"].backward()
             self.optimizer.step()
             for name, value in parts.items():
                 totals[name] += float(value.detach()) / steps

@@ -29,7 +29,8 @@ from nesy.world_model.storage import load_tensors, save_tensors, save_world_mode
 from nesy.world_model.symbolic_training import SymbolicTrainer
 
 CHECKPOINT = "checkpoint.safetensors"
-TRAINERS = {"symbolic": SymbolicTrainer, "paper": PaperTrainer}
+Trainer = SymbolicTrainer | PaperTrainer
+TRAINERS: dict[str, type[SymbolicTrainer] | type[PaperTrainer]] = {"symbolic": SymbolicTrainer, "paper": PaperTrainer}
 SHOWN = ("loss", "views_exact", "next_code_nll", "code_agreement")
 
 
@@ -84,7 +85,7 @@ def _train(
         if apart.any() and not apart.all():
             training = transitions_of(experience.select(~apart), base=everything)
             held_out = transitions_of(experience.select(apart))
-    trainer = TRAINERS[config.architecture](config, seed, everything, training, held_out)
+    trainer: Trainer = TRAINERS[config.architecture](config, seed, everything, training, held_out)
     fingerprint = _fingerprint(config, seed, everything)
     tick, elapsed = _resume(trainer, folder / CHECKPOINT, fingerprint)
     with MetricsLog(folder, keep=tick) as log, progress.task("training the world model", trainer.length()) as bar:
@@ -140,7 +141,7 @@ def _fingerprint(config: TrainConfig, seed: int, transitions: Transitions) -> st
     return digest.hexdigest()
 
 
-def _resume(trainer: SymbolicTrainer | PaperTrainer, path: Path, fingerprint: str) -> tuple[int, float]:
+def _resume(trainer: Trainer, path: Path, fingerprint: str) -> tuple[int, float]:
     """Restore the checkpoint, if there is one of this very training; returns its tick and the seconds used."""
     if not path.exists():
         return 0, 0.0
