@@ -109,8 +109,8 @@ def extract(
 def with_counts(dbn: TwoSliceDBN, codes: np.ndarray, actions: np.ndarray, next_codes: np.ndarray) -> TwoSliceDBN:
     """The same model with the number of the given transitions behind every row.
 
-    Also sets the tables `taken` int64 [A], how often each action was taken, and `changed` int64 [A, N], in how
-    many of its transitions each factor changed its value.
+    Also sets the tables `codes` uint8 [C, N], the distinct codes met, `taken` int64 [A], how often each action was
+    taken, and `changed` int64 [A, N], in how many of its transitions each factor changed its value.
     """
     counts = np.zeros(len(dbn.probabilities), dtype=np.int64)
     taken = np.zeros(dbn.num_actions, dtype=np.int64)
@@ -124,7 +124,9 @@ def with_counts(dbn: TwoSliceDBN, codes: np.ndarray, actions: np.ndarray, next_c
             start = dbn.offsets[a, i]
             rows = dbn.num_rows(a, i)
             counts[start : start + rows] = np.bincount(dbn.rows(a, i, now, later), minlength=rows)
-    return replace(dbn, row_counts=counts, tables={**dbn.tables, "taken": taken, "changed": changed})
+    met = np.unique(np.concatenate([codes, next_codes]).astype(np.uint8), axis=0)
+    tables = {**dbn.tables, "codes": met, "taken": taken, "changed": changed}
+    return replace(dbn, row_counts=counts, tables=tables)
 
 
 def marginals(codes: np.ndarray, num_values: int) -> np.ndarray:

@@ -6,6 +6,7 @@ import importlib
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
@@ -32,19 +33,22 @@ FORMATS: dict[str, Format] = {
     "jgum": Format("jgum", ".jgum", True, "pyAgrum: one Bayesian network, a copy of slice t+1 per action; bit-equal"),
     "bif": Format("bif", ".bif", False, "the same for any Bayesian network tool, nine digits"),
     "prism": Format("prism", ".prism", False, "Storm and PRISM: one module per factor, synchronised on the action"),
+    "rddl": Format("rddl", ".rddl", False, "pyRDDLGym; the instance goes into NAME_instance.rddl beside it"),
+    "pddl": Format("pddl", ".pddl", False, "classical planners: most probable outcomes, with NAME_problem.pddl"),
     "graphml": Format("graphml", ".graphml", False, "the graph for Gephi, yEd and networkx"),
     "dot": Format("dot", ".dot", False, "the graph for Graphviz"),
     "asp": Format("asp_facts", ".lp", False, "facts for clingo (vocabulary: docs/asp.md)"),
 }
 
 
-def export(dbn: TwoSliceDBN, path: Path | str, format: str | None = None) -> None:
+def export(dbn: TwoSliceDBN, path: Path | str, format: str | None = None, **options: Any) -> None:
     """Write a model in one of `FORMATS`.
 
     Args:
         dbn: the model.
         path: where to write; a file, or a folder for `native`.
         format: a key of `FORMATS`; by default the one that the path's ending tells.
+        options: what the format's `write` takes besides (a start, goals, ...).
 
     Raises:
         UserError: no such format, or the model has something that the format cannot hold.
@@ -54,7 +58,7 @@ def export(dbn: TwoSliceDBN, path: Path | str, format: str | None = None) -> Non
     if FORMATS[name].suffix and path.is_dir():
         raise UserError(f"{path}: is a folder; the format '{name}' is one file")
     try:
-        _module(name).write(dbn, path)
+        _module(name).write(dbn, path, **options)
     except OSError as error:
         raise UserError(f"{path}: cannot be written ({error.strerror or error})") from None
 

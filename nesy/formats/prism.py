@@ -18,9 +18,15 @@ from nesy.formats.bayes_nodes import identifier
 from nesy.run_folder import atomic_path
 
 
-def write(dbn: TwoSliceDBN, path: Path) -> None:
-    """Write `dbn` as a Markov decision process that starts in each factor's most probable initial value."""
-    text = model_text(dbn, dbn.initial.argmax(axis=1))
+def write(
+    dbn: TwoSliceDBN,
+    path: Path,
+    start: np.ndarray | None = None,
+    plan: Sequence[int] | None = None,
+    factors: Sequence[int] | None = None,
+) -> None:
+    """Write `dbn` to the file `path` (see `model_text`); by default it starts in the most probable initial values."""
+    text = model_text(dbn, dbn.initial.argmax(axis=1) if start is None else start, plan, factors)
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 

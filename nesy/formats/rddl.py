@@ -1,0 +1,81 @@
+"""RDDL for pyRDDLGym: every table is a non-fluent indexed by the parents' values.
+
+Rows are many and RDDL is read slowly, so above `MAX_ENTRIES` only the rows met in experience are written; all
+others are then uniform, and the file says so.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from nesy.dbn.model import TwoSliceDBN
+from nesy.errors import UserError
+from nesy.formats.bayes_nodes import identifier
+from nesy.run_folder import atomic_path
+
+MAX_ENTRIES = 200_000
+
+
+def write(dbn: TwoSliceDBN, path: Path, start: np.ndarray | None = None, horizon: int = 100) -> None:
+    """Write the domain to `path` and the instance to `NAME_instance.rddl` beside it.
+
+    Args:
+        dbn: the model.
+        path: the domain's file.
+        start: integers [N]: the initial code; by default each factor's most probable initial value.
+        horizon: steps of an episode.
+
+    Raises:
+        UserError: the rows met in experience are too many for this format.
+    """
+    every = dbn.probabilities.size <= MAX_ENTRIES
+    if not every and int((dbn.row_counts > 0).sum()) * dbn.num_values > MAX_ENTRIES:
+        raise UserError(f"RDDL files hold at most {MAX_ENTRIES} probabilities; use another format, e.g. parquet")
+    code = dbn.initial.argmax(axis=1) if start is None else np.asarray(start)
+    actions = [f"do_{identifier(name)}" for name in dbn.action_names]
+    left_out = "" if every else "// Rows never met in experience are uniform here.\n"
+    domain = left_out + _domain(dbn, actions)
+    with atomic_path(path) as temporary:
+        temporary.write_text(domain, encoding="utf-8")
+    with atomic_path(path.with_name(f"{path.stem}_instance{path.suffix}")) as temporary:
+        temporary.write_text(_instance(dbn, code, horizon, every), encoding="utf-8")
+
+
+def _domain(dbn: TwoSliceDBN, actions: list[str]) -> str:
+    values = ", ".join(f"@v{k}" for k in range(dbn.num_values))
+    lines = ["domain dbn {", f"  types {{ val : {{ {values} }}; }};", "  pvariables {"]
+    for a in range(dbn.num_actions):
+        for i in range(dbn.num_factors):
+            types = ", ".join(["val"] * (len(dbn.parents(a, i)) + 1))
+            lines.append(f"    p_{a}_{i}({types}) : {{ non-fluent, real, default = {1.0 / dbn.num_values:.17f} }};")
+    lines += [f"    x{i} : {{ state-fluent, val, default = @v0 }};" for i in range(dbn.num_factors)]
+    lines += [f"    {action} : {{ action-fluent, bool, default = false }};" for action in actions]
+    lines += ["  };", "  cpfs {"]
+    for i in range(dbn.num_factors):
+        # no action: everything stays
+        branches = f"x{i}"
+        for a in reversed(range(dbn.num_actions)):
+            parents = [f"x{p}" + ("'" if where else "") for where, p in dbn.parents(a, i)]
+            index = ", ".join([*parents, "?v"])
+            branches = f"if ({actions[a]}) then Discrete_{{?v : val}}(p_{a}_{i}({index})) else ({branches})"
+        lines.append(f"    x{i}' = {branches};")
+    return "\n".join([*lines, "  };", "  reward = 0;", "}"]) + "\n"
+
+
+def _instance(dbn: TwoSliceDBN, code: np.ndarray, horizon: int, every: bool) -> str:
+    lines = ["non-fluents tables {", "  domain = dbn;", "  non-fluents {"]
+    for a in range(dbn.num_actions):
+        for i in range(dbn.num_factors):
+            table, counts = dbn.cpt(a, i), dbn.counts(a, i)
+            shape = (dbn.num_values,) * len(dbn.parents(a, i))
+            for row in range(len(table)) if every else np.flatnonzero(counts).tolist():
+                context = np.unravel_index(row, shape) if shape else ()
+                for k, p in enumerate(table[row].tolist()):
+                    index = ", ".join(f"@v{v}" for v in (*context, k))
+                    lines.append(f"    p_{a}_{i}({index}) = {np.format_float_positional(p)};")
+    start = " ".join(f"x{i} = @v{int(v)};" for i, v in enumerate(code))
+    lines += ["  };", "}", "instance start {", "  domain = dbn;", "  non-fluents = tables;"]
+    lines += [f"  init-state {{ {start} }};", "  max-nondef-actions = 1;", f"  horizon = {horizon};"]
+    return "\n".join([*lines, "  discount = 1.0;", "}"]) + "\n"
