@@ -124,6 +124,10 @@ class Batch:
             self.world.grid[:] = grid
         everywhere = np.ones(self.num_envs, np.bool_)
         kernel.begin_batch(self.rules, self.world, self.store, self.maps, everywhere, grid is not None, self.last)
+        if self.task == "following":
+            kernel.measure_batch(self.world, self.store, self.last.distance)
+        else:
+            self.last.distance[:] = 0
         if waiting is not None:
             self.world.person[:, WAITING] = waiting
 

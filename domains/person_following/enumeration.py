@@ -129,8 +129,8 @@ def _collect_transitions(grids, see_through_walls, places, before, actions, afte
                         elif action == 2 and grids[m, x + step_x(heading), y + step_y(heading)] != WALL:
                             nx, ny = x + step_x(heading), y + step_y(heading)
                         places[count], actions[count] = m, action
-                        look(grids[m], x, y, heading, see_through_walls, before[count])
-                        look(grids[m], nx, ny, turned, see_through_walls, after[count])
+                        look(grids, m, x, y, heading, see_through_walls, before, count)
+                        look(grids, m, nx, ny, turned, see_through_walls, after, count)
                         count += 1
 
 
@@ -142,6 +142,6 @@ def _collect_views(grids, see_through_walls, views):  # type: ignore[no-untyped-
             for y in range(grids.shape[2]):
                 if grids[m, x, y] != WALL:
                     for heading in range(4):
-                        look(grids[m], x, y, heading, see_through_walls, views[count])
+                        look(grids, m, x, y, heading, see_through_walls, views, count)
                         count += 1
     return count

@@ -68,7 +68,7 @@ class PersonFollowingEnv(gymnasium.Env):
         write_back(batch.world.stream[0], self.np_random)
         last = batch.last
         observation = {"view": last.robot_view[0].copy(), "configuration": last.configuration[0]}
-        return observation, {"distance": int(last.distance[0]), "visible": bool(last.visible[0])}
+        return observation, {"distance": int(last.distance[0]), "visible": bool(last.configuration[0] > 0)}
 
     def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Take one action.

@@ -13,26 +13,26 @@ _MAX_RIVERS = MAX_SIZE
 
 
 @njit(cache=True)
-def generate_crossing(stream, grid, num_crossings):  # type: ignore[no-untyped-def]
-    """Fill `grid` [size, size] with a new crossing map; the goal is at (size-2, size-2).
+def generate_crossing(streams, grids, b, num_crossings):  # type: ignore[no-untyped-def]
+    """Fill `grids[b]` with a new crossing map; the goal is at (size-2, size-2).
 
     The order of the draws is Minigrid's: shuffle the rivers (vertical ones first), shuffle the directions of
     the path from room to room, then one opening per step of that path.
     """
-    size = grid.shape[0]
+    size = grids.shape[1]
     last = size - 1
     for x in range(size):
         for y in range(size):
             border = x == 0 or y == 0 or x == last or y == last
-            grid[x, y] = WALL if border else EMPTY
-    grid[size - 2, size - 2] = GOAL
+            grids[b, x, y] = WALL if border else EMPTY
+    grids[b, size - 2, size - 2] = GOAL
 
     per_direction = (size - 3) // 2
     rivers = np.empty(_MAX_RIVERS, np.int64)
     for i in range(per_direction):
         rivers[i] = 2 + 2 * i
         rivers[per_direction + i] = -(2 + 2 * i)
-    shuffle(stream, rivers, 2 * per_direction)
+    shuffle(streams, b, rivers, 2 * per_direction)
 
     # Coordinates at which a river stands; limits between rooms follow from walking over them in order.
     vertical = np.zeros(MAX_SIZE + 1, np.bool_)
@@ -47,13 +47,13 @@ def generate_crossing(stream, grid, num_crossings):  # type: ignore[no-untyped-d
     for k in range(1, last):
         for m in range(1, last):
             if vertical[k] or horizontal[m]:
-                grid[k, m] = WALL
+                grids[b, k, m] = WALL
 
     # True: a step through a vertical river, to the next room on the right.
     path = np.zeros(_MAX_RIVERS, np.bool_)
     for k in range(num_vertical):
         path[k] = True
-    shuffle(stream, path, num_crossings)
+    shuffle(streams, b, path, num_crossings)
     left, top = 0, 0
     for k in range(num_crossings):
         right, bottom = left + 1, top + 1
@@ -62,8 +62,8 @@ def generate_crossing(stream, grid, num_crossings):  # type: ignore[no-untyped-d
         while bottom < last and not horizontal[bottom]:
             bottom += 1
         if path[k]:
-            grid[right, top + 1 + draw_below(stream, bottom - top - 1)] = EMPTY
+            grids[b, right, top + 1 + draw_below(streams, b, bottom - top - 1)] = EMPTY
             left = right
         else:
-            grid[left + 1 + draw_below(stream, right - left - 1), bottom] = EMPTY
+            grids[b, left + 1 + draw_below(streams, b, right - left - 1), bottom] = EMPTY
             top = bottom

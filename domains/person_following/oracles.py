@@ -93,7 +93,7 @@ class FullStatePolicy:
     ) -> None:
         """Keep the maps as played, and the actions in the states that the policy reaches on each."""
         self._grids, self._parameters, self._discount, self._solved = grids, parameters, discount, solved
-        self._index = {int(map_hash(grid)): m for m, grid in enumerate(grids)}
+        self._index = {int(map_hash(grids, m)): m for m in range(len(grids))}
         self._whole_policy = lru_cache(maxsize=8)(self._solve_again)
 
     def actions(self, env: BatchedEnvironment) -> NDArray[np.int64]:

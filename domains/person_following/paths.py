@@ -91,11 +91,12 @@ def _pop(heap, count):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def astar(grid, x, y, heading, goal_x, goal_y, goal_heading, compare, scratch):  # type: ignore[no-untyped-def]
+def astar(grids, b, x, y, heading, goal_x, goal_y, goal_heading, compare, scratch):  # type: ignore[no-untyped-def]
     """A* from a pose to a cell; the actions go to `scratch.path`.
 
     Args:
-        grid: cell kinds [size, size].
+        grids: cell kinds [B, size, size].
+        b: which of them.
         x: of the start.
         y: of the start.
         heading: of the start.
@@ -108,7 +109,7 @@ def astar(grid, x, y, heading, goal_x, goal_y, goal_heading, compare, scratch): 
     Returns:
         The number of actions; NO_PATH where there is none.
     """
-    size = grid.shape[0]
+    size = grids.shape[1]
     stamp, cost, came_from, heap, path = scratch
     last = stamp.shape[0] - 1
     stamp[last] += 1
@@ -143,7 +144,7 @@ def astar(grid, x, y, heading, goal_x, goal_y, goal_heading, compare, scratch): 
             else:
                 nx += step_x(h)
                 ny += step_y(h)
-                if nx < 0 or ny < 0 or nx >= size or ny >= size or grid[nx, ny] == WALL:
+                if nx < 0 or ny < 0 or nx >= size or ny >= size or grids[b, nx, ny] == WALL:
                     continue
             following = (nx * size + ny) * 4 + nh
             if stamp[following] == search and next_cost >= cost[following]:
@@ -160,11 +161,12 @@ def astar(grid, x, y, heading, goal_x, goal_y, goal_heading, compare, scratch): 
 
 
 @njit(cache=True)
-def distance_field(grid, x, y, heading, compare, until, distances, scratch):  # type: ignore[no-untyped-def]
+def distance_field(grids, b, x, y, heading, compare, until, distances, scratch):  # type: ignore[no-untyped-def]
     """Breadth-first distances TO a pose, backward from it.
 
     Args:
-        grid: cell kinds [size, size].
+        grids: cell kinds [B, size, size].
+        b: which of them.
         x: of the target pose.
         y: of the target pose.
         heading: of the target pose.
@@ -176,7 +178,7 @@ def distance_field(grid, x, y, heading, compare, until, distances, scratch):  # 
     Returns:
         The distance of `until`, NO_PATH where there is none.
     """
-    size = grid.shape[0]
+    size = grids.shape[1]
     stamp, cost, queue = scratch.stamp, scratch.cost, scratch.heap
     last = stamp.shape[0] - 1
     stamp[last] += 1
@@ -213,7 +215,7 @@ def distance_field(grid, x, y, heading, compare, until, distances, scratch):  # 
             else:
                 bx = cx - step_x(h)
                 by = cy - step_y(h)
-                if bx < 0 or by < 0 or bx >= size or by >= size or grid[bx, by] == WALL:
+                if bx < 0 or by < 0 or bx >= size or by >= size or grids[b, bx, by] == WALL:
                     continue
                 before = (bx * size + by) * 4 + h
             if stamp[before] != search:

@@ -53,7 +53,7 @@ def person_chain(grid: NDArray[np.uint8], start: tuple[int, int, int], parameter
     size = len(grid)
     goal_x, goal_y = (int(v) for v in np.argwhere(grid == 2)[0])
     scratch = allocate_scratch(size)
-    length = astar(grid, *start, goal_x, goal_y, -1, False, scratch)
+    length = astar(grid[None], 0, *start, goal_x, goal_y, -1, False, scratch)
     route = scratch.path[: max(length, 0)].tolist()
     person = [start]
     for action in route:
@@ -93,9 +93,9 @@ def person_chain(grid: NDArray[np.uint8], start: tuple[int, int, int], parameter
     distance = np.empty(shape, np.int16)
     configuration = np.empty(shape, np.int64)
     moves = np.empty((*shape, 4), np.int64)
-    view = np.empty((parameters.view_size, parameters.view_size), np.uint8)
+    view = np.empty((1, parameters.view_size, parameters.view_size), np.uint8)
     _fill(
-        grid,
+        grid[None],
         poses,
         pose_index,
         people,
@@ -124,16 +124,17 @@ def person_chain(grid: NDArray[np.uint8], start: tuple[int, int, int], parameter
 
 @njit(cache=True)
 def _fill(  # type: ignore[no-untyped-def]
-    grid, poses, pose_index, people, heading_rule, see_through, view, distance, configuration, moves, scratch
+    grids, poses, pose_index, people, heading_rule, see_through, view, distance, configuration, moves, scratch
 ):
+    grid = grids[0]
     size = grid.shape[0]
     field = np.empty(size * size * 4, np.int16)
     for c in range(poses.shape[0]):
         x, y, h = poses[c, 0], poses[c, 1], poses[c, 2]
-        look(grid, x, y, h, see_through, view)
+        look(grids, 0, x, y, h, see_through, view, 0)
         for p in range(people.shape[0]):
             side, ahead, heading = relative(x, y, h, people[p, 0], people[p, 1], people[p, 2])
-            configuration[p, c] = configuration_of(view, side, ahead, heading, see_through)
+            configuration[p, c] = configuration_of(view, 0, side, ahead, heading, see_through)
             moves[p, c, 0] = pose_index[x, y, (h + 3) & 3]
             moves[p, c, 1] = pose_index[x, y, (h + 1) & 3]
             fx, fy = x + step_x(h), y + step_y(h)
@@ -143,7 +144,7 @@ def _fill(  # type: ignore[no-untyped-def]
     for p in range(people.shape[0]):
         heading = people[p, 2]
         compare = heading_rule == HEADING_ALWAYS or (heading_rule != HEADING_NEVER and heading != 0)
-        distance_field(grid, people[p, 0], people[p, 1], heading, compare, -1, field, scratch)
+        distance_field(grids, 0, people[p, 0], people[p, 1], heading, compare, -1, field, scratch)
         for c in range(poses.shape[0]):
             found = field[(poses[c, 0] * size + poses[c, 1]) * 4 + poses[c, 2]]
             distance[p, c] = 0 if found == NO_PATH else found

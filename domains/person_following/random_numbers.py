@@ -65,9 +65,9 @@ def write_back(stream: NDArray[np.uint64], generator: np.random.Generator) -> No
 
 
 @njit(cache=True)
-def next_64(stream):  # type: ignore[no-untyped-def]
+def next_64(streams, b):  # type: ignore[no-untyped-def]
     """The next 64 random bits."""
-    high, low = stream[0], stream[1]
+    high, low = streams[b, 0], streams[b, 1]
     # 128-bit product state * multiplier, low 128 bits, from 32-bit halves of the low words.
     a0, a1 = low & _LOW_32, low >> _32
     b0, b1 = _MULTIPLIER_LOW & _LOW_32, _MULTIPLIER_LOW >> _32
@@ -76,30 +76,30 @@ def next_64(stream):  # type: ignore[no-untyped-def]
     carry = a1 * b1 + (middle >> _32) + (middle_low >> _32)
     product_low = low * _MULTIPLIER_LOW
     product_high = carry + high * _MULTIPLIER_LOW + low * _MULTIPLIER_HIGH
-    low = product_low + stream[3]
-    high = product_high + stream[2]
+    low = product_low + streams[b, 3]
+    high = product_high + streams[b, 2]
     if low < product_low:
         high += _ONE
-    stream[0], stream[1] = high, low
+    streams[b, 0], streams[b, 1] = high, low
     value = high ^ low
     turn = high >> _58
     return (value >> turn) | (value << ((_64 - turn) & _63))
 
 
 @njit(cache=True)
-def next_32(stream):  # type: ignore[no-untyped-def]
+def next_32(streams, b):  # type: ignore[no-untyped-def]
     """The next 32 random bits, as a uint64; every second call takes the kept half of a 64-bit draw."""
-    if stream[4] != _ZERO:
-        stream[4] = _ZERO
-        return stream[5]
-    value = next_64(stream)
-    stream[4] = _ONE
-    stream[5] = value >> _32
+    if streams[b, 4] != _ZERO:
+        streams[b, 4] = _ZERO
+        return streams[b, 5]
+    value = next_64(streams, b)
+    streams[b, 4] = _ONE
+    streams[b, 5] = value >> _32
     return value & _LOW_32
 
 
 @njit(cache=True)
-def draw_interval(stream, largest):  # type: ignore[no-untyped-def]
+def draw_interval(streams, b, largest):  # type: ignore[no-untyped-def]
     """Uniform on 0..largest by masked rejection: what `Generator.shuffle` draws."""
     if largest == 0:
         return 0
@@ -107,30 +107,30 @@ def draw_interval(stream, largest):  # type: ignore[no-untyped-def]
     while mask < largest:
         mask = (mask << 1) | 1
     while True:
-        value = np.int64(next_32(stream)) & mask
+        value = np.int64(next_32(streams, b)) & mask
         if value <= largest:
             return value
 
 
 @njit(cache=True)
-def draw_below(stream, bound):  # type: ignore[no-untyped-def]
+def draw_below(streams, b, bound):  # type: ignore[no-untyped-def]
     """Uniform on 0..bound-1 by Lemire's method: what `Generator.integers` and `choice` draw."""
     if bound <= 1:
         return 0
     wide = np.uint64(bound)
-    product = next_32(stream) * wide
+    product = next_32(streams, b) * wide
     rest = product & _LOW_32
     if rest < wide:
         threshold = (_LOW_32 - (wide - _ONE)) % wide
         while rest < threshold:
-            product = next_32(stream) * wide
+            product = next_32(streams, b) * wide
             rest = product & _LOW_32
     return np.int64(product >> _32)
 
 
 @njit(cache=True)
-def shuffle(stream, values, count):  # type: ignore[no-untyped-def]
+def shuffle(streams, b, values, count):  # type: ignore[no-untyped-def]
     """Shuffle `values[:count]` in place, as `Generator.shuffle` shuffles a list."""
     for i in range(count - 1, 0, -1):
-        j = draw_interval(stream, i)
+        j = draw_interval(streams, b, i)
         values[i], values[j] = values[j], values[i]

@@ -80,20 +80,20 @@ def shared_store(size: int, heading_rule: int) -> Store:
 
 
 @njit(cache=True)
-def map_hash(grid):  # type: ignore[no-untyped-def]
+def map_hash(grids, b):  # type: ignore[no-untyped-def]
     """A stable hash of a grid: 64-bit FNV-1a over its bytes in C order, without the sign bit."""
     value = np.uint64(0xCBF29CE484222325)
-    size = grid.shape[0]
+    size = grids.shape[1]
     for x in range(size):
         for y in range(size):
-            value = (value ^ np.uint64(grid[x, y])) * np.uint64(0x100000001B3)
+            value = (value ^ np.uint64(grids[b, x, y])) * np.uint64(0x100000001B3)
     return np.int64(value & np.uint64(0x7FFFFFFFFFFFFFFF))
 
 
 @njit(cache=True)
-def enter_map(store, grid, grid_hash, x, y, heading, goal_x, goal_y):  # type: ignore[no-untyped-def]
+def enter_map(store, grids, b, grid_hash, x, y, heading, goal_x, goal_y):  # type: ignore[no-untyped-def]
     """Slot of a map with a person's start and goal, its plan computed; -1 where the store is full."""
-    size = grid.shape[0]
+    size = grids.shape[1]
     extra = (x, y, heading, goal_x, goal_y)
     mixed = np.uint64(grid_hash)
     for value in extra:
@@ -109,7 +109,7 @@ def enter_map(store, grid, grid_hash, x, y, heading, goal_x, goal_y):  # type: i
         if same:
             for cx in range(size):
                 for cy in range(size):
-                    if keys[slot, cx * size + cy] != grid[cx, cy]:
+                    if keys[slot, cx * size + cy] != grids[b, cx, cy]:
                         same = False
                         break
                 if not same:
@@ -129,10 +129,10 @@ def enter_map(store, grid, grid_hash, x, y, heading, goal_x, goal_y):  # type: i
     store.buckets[bucket] = slot
     for cx in range(size):
         for cy in range(size):
-            keys[slot, cx * size + cy] = grid[cx, cy]
+            keys[slot, cx * size + cy] = grids[b, cx, cy]
     for i in range(5):
         keys[slot, size * size + i] = extra[i]
-    length = max(astar(grid, x, y, heading, goal_x, goal_y, -1, False, store.scratch), 0)
+    length = max(astar(grids, b, x, y, heading, goal_x, goal_y, -1, False, store.scratch), 0)
     for i in range(length):
         store.plan[slot, i] = store.scratch.path[i]
     store.plan_length[slot] = length
@@ -147,18 +147,18 @@ def _compared(store, heading):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _row(store, grid, slot, x, y, heading):  # type: ignore[no-untyped-def]
+def _row(store, grids, b, slot, x, y, heading):  # type: ignore[no-untyped-def]
     """Row of the tables for a target pose on a map met before, filled if need be; -1 where there is none."""
     if slot < 0 or store.visits[slot] < 2:
         return -1
-    size = grid.shape[0]
+    size = grids.shape[1]
     compare = _compared(store, heading)
     target = (x * size + y) * 4 + (heading if compare else 0)
     row = store.row_of[slot, target]
     if row < 0 and store.used[ROWS_USED] < store.distance.shape[0]:
         row = np.int32(store.used[ROWS_USED])
         store.used[ROWS_USED] += 1
-        distance_field(grid, x, y, heading, compare, -1, store.distance[row], store.scratch)
+        distance_field(grids, b, x, y, heading, compare, -1, store.distance[row], store.scratch)
         for pose in range(store.first.shape[1]):
             store.first[row, pose] = -1
         store.row_of[slot, target] = row
@@ -166,26 +166,26 @@ def _row(store, grid, slot, x, y, heading):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def distance(store, grid, slot, x, y, heading, to_x, to_y, to_heading):  # type: ignore[no-untyped-def]
+def distance(store, grids, b, slot, x, y, heading, to_x, to_y, to_heading):  # type: ignore[no-untyped-def]
     """Number of actions of a shortest path from a pose to another, by the store's heading rule; or NO_PATH."""
-    pose = (x * grid.shape[0] + y) * 4 + heading
-    row = _row(store, grid, slot, to_x, to_y, to_heading)
+    pose = (x * grids.shape[1] + y) * 4 + heading
+    row = _row(store, grids, b, slot, to_x, to_y, to_heading)
     if row >= 0:
         return np.int64(store.distance[row, pose])
     compare = _compared(store, to_heading)
-    return np.int64(distance_field(grid, to_x, to_y, to_heading, compare, pose, store.distance[0, :0], store.scratch))
+    return np.int64(distance_field(grids, b, to_x, to_y, to_heading, compare, pose, store.distance[0, :0], store.scratch))
 
 
 @njit(cache=True)
-def first_action(store, grid, slot, x, y, heading, to_x, to_y, to_heading):  # type: ignore[no-untyped-def]
+def first_action(store, grids, b, slot, x, y, heading, to_x, to_y, to_heading):  # type: ignore[no-untyped-def]
     """First action of the A* path from a pose to a person's pose; STAY where there or where none exists."""
-    pose = (x * grid.shape[0] + y) * 4 + heading
-    row = _row(store, grid, slot, to_x, to_y, to_heading)
+    pose = (x * grids.shape[1] + y) * 4 + heading
+    row = _row(store, grids, b, slot, to_x, to_y, to_heading)
     if row >= 0 and store.first[row, pose] >= 0:
         return np.int64(store.first[row, pose])
     compare = _compared(store, to_heading)
     heuristic_heading = -1 if store.heading_rule[0] == HEADING_NEVER else to_heading
-    length = astar(grid, x, y, heading, to_x, to_y, heuristic_heading, compare, store.scratch)
+    length = astar(grids, b, x, y, heading, to_x, to_y, heuristic_heading, compare, store.scratch)
     action = np.int64(store.scratch.path[0]) if length > 0 else np.int64(STAY)
     if row >= 0:
         store.first[row, pose] = action
@@ -193,13 +193,13 @@ def first_action(store, grid, slot, x, y, heading, to_x, to_y, to_heading):  # t
 
 
 @njit(cache=True)
-def first_action_to_goal(store, grid, slot, x, y, heading, goal_x, goal_y):  # type: ignore[no-untyped-def]
+def first_action_to_goal(store, grids, b, slot, x, y, heading, goal_x, goal_y):  # type: ignore[no-untyped-def]
     """First action of the A* path from a pose to the goal cell; STAY where there or where none exists."""
-    pose = (x * grid.shape[0] + y) * 4 + heading
+    pose = (x * grids.shape[1] + y) * 4 + heading
     kept = slot >= 0 and store.visits[slot] >= 2
     if kept and store.goal_first[slot, pose] >= 0:
         return np.int64(store.goal_first[slot, pose])
-    length = astar(grid, x, y, heading, goal_x, goal_y, -1, False, store.scratch)
+    length = astar(grids, b, x, y, heading, goal_x, goal_y, -1, False, store.scratch)
     action = np.int64(store.scratch.path[0]) if length > 0 else np.int64(STAY)
     if kept:
         store.goal_first[slot, pose] = action

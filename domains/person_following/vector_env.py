@@ -80,7 +80,7 @@ class PersonFollowingVectorEnv(VectorEnv):
             "view": last.robot_view.copy(),
             "configuration": last.configuration.copy(),
         }
-        return observation, {"distance": last.distance.copy(), "visible": last.visible.copy()}
+        return observation, {"distance": last.distance.copy(), "visible": last.configuration > 0}
 
     def step(
         self, actions: Any

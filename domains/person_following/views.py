@@ -9,14 +9,14 @@ from domains.person_following.paths import step_x, step_y
 
 
 @njit(cache=True)
-def look(grid, x, y, heading, see_through_walls, view):  # type: ignore[no-untyped-def]
-    """Fill `view` uint8 [v, v] with the cell kinds that a pose sees; agents are not shown.
+def look(grids, b, x, y, heading, see_through_walls, views, i):  # type: ignore[no-untyped-def]
+    """Fill `views[i]` (uint8 [v, v]) with the cell kinds that a pose sees in `grids[b]`; agents are not shown.
 
     Outside the map counts as wall; the viewer's own cell shows as empty. Without looking through walls,
     Minigrid's `Grid.process_vis` decides, and cells not visible are UNSEEN.
     """
-    size = grid.shape[0]
-    width = view.shape[0]
+    size = grids.shape[1]
+    width = views.shape[1]
     half = width // 2
     fx, fy = step_x(heading), step_y(heading)
     for vx in range(width):
@@ -29,12 +29,12 @@ def look(grid, x, y, heading, see_through_walls, view):  # type: ignore[no-untyp
             cx = column_x + ahead * fx
             cy = column_y + ahead * fy
             if 0 <= cx < size and 0 <= cy < size:
-                view[vx, vy] = grid[cx, cy]
+                views[i, vx, vy] = grids[b, cx, cy]
             else:
-                view[vx, vy] = WALL
+                views[i, vx, vy] = WALL
     if not see_through_walls:
-        _hide(view)
-    view[half, width - 1] = EMPTY
+        _hide(views[i])
+    views[i, half, width - 1] = EMPTY
 
 
 @njit(cache=True)
@@ -75,13 +75,13 @@ def relative(x, y, heading, other_x, other_y, other_heading):  # type: ignore[no
 
 
 @njit(cache=True)
-def configuration_of(view, side, ahead, heading, see_through_walls):  # type: ignore[no-untyped-def]
-    """The configuration of an agent at a relative pose: 0 where it is out of the view, hidden or on top."""
-    width = view.shape[0]
+def configuration_of(views, i, side, ahead, heading, see_through_walls):  # type: ignore[no-untyped-def]
+    """Configuration, in `views[i]`, of an agent at a relative pose: 0 where out of view, hidden or on top."""
+    width = views.shape[1]
     half = width // 2
     if ahead < 0 or ahead >= width or side < -half or side > half or (side == 0 and ahead == 0):
         return 0
     vx, vy = half + side, width - 1 - ahead
-    if not see_through_walls and view[vx, vy] == UNSEEN:
+    if not see_through_walls and views[i, vx, vy] == UNSEEN:
         return 0
     return 1 + (vx * width + vy) * 4 + heading

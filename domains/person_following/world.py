@@ -40,6 +40,9 @@ class Results(NamedTuple):
     distance: NDArray[np.int64]  # [B]
     visible: NDArray[np.bool_]  # [B]
     person_action: NDArray[np.int8]  # [B]
+    acted: NDArray[np.int64]  # [B]: what the robot did, resting included
+    entered: NDArray[np.bool_]  # [B]: whether it entered the goal
+    ended: NDArray[np.bool_]  # [B]: whether a new episode began
     final_view: NDArray[np.uint8]  # [B, v, v]
     final_configuration: NDArray[np.int64]  # [B]
     final_person_view: NDArray[np.uint8]  # [B, v, v]
@@ -72,6 +75,9 @@ def allocate_results(num_envs: int, view_size: int) -> Results:
         distance=np.empty(num_envs, np.int64),
         visible=np.empty(num_envs, np.bool_),
         person_action=np.empty(num_envs, np.int8),
+        acted=np.empty(num_envs, np.int64),
+        entered=np.empty(num_envs, np.bool_),
+        ended=np.empty(num_envs, np.bool_),
         final_view=np.empty((num_envs, view_size, view_size), np.uint8),
         final_configuration=np.empty(num_envs, np.int64),
         final_person_view=np.empty((num_envs, view_size, view_size), np.uint8),

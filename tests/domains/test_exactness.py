@@ -48,15 +48,15 @@ def test_changed_rules_equal_the_reference(changes):
 @pytest.mark.parametrize(("size", "crossings"), [(5, 1), (5, 2), (9, 0), (9, 1), (9, 2), (9, 6), (13, 3), (31, 9)])
 def test_maps_equal_minigrid(size, crossings):
     original = CrossingEnv(size=size, num_crossings=crossings, obstacle_type=Wall)
-    grid = np.zeros((size, size), np.uint8)
+    grids = np.zeros((1, size, size), np.uint8)
     kinds = np.zeros(11, np.uint8)
     kinds[[1, 2, 8]] = 0, 1, 2
     for seed in range(25):
         original.reset(seed=seed)
-        stream = seeded_stream(seed)
+        stream = seeded_stream(seed)[None]
         for _ in range(3):
-            generate_crossing(stream, grid, crossings)
-            assert (kinds[original.grid.encode()[:, :, 0]] == grid).all()
+            generate_crossing(stream, grids, 0, crossings)
+            assert (kinds[original.grid.encode()[:, :, 0]] == grids[0]).all()
             original.reset()
 
 
@@ -90,8 +90,7 @@ def test_random_stream_goes_on_where_numpy_stands():
     generator = np.random.default_rng(5)
     generator.integers(7)
     stream = stream_of(generator)
-    grid = np.zeros((9, 9), np.uint8)
-    generate_crossing(stream, grid, 2)
+    generate_crossing(stream[None], np.zeros((1, 9, 9), np.uint8), 0, 2)
     other = np.random.default_rng(0)
     write_back(stream, other)
     again = stream_of(other)

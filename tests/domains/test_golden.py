@@ -30,11 +30,11 @@ def test_map_probabilities_are_those_of_the_generator(domain):
     maps, weights = domain.maps(size=7, num_crossings=2)
     keys = {grid.tobytes(): m for m, grid in enumerate(maps)}
     counts = np.zeros(len(maps))
-    stream, grid = seeded_stream(0), np.zeros((7, 7), np.uint8)
+    stream, grids = seeded_stream(0)[None], np.zeros((1, 7, 7), np.uint8)
     draws = 40_000
     for _ in range(draws):
-        generate_crossing(stream, grid, 2)
-        counts[keys[grid.tobytes()]] += 1
+        generate_crossing(stream, grids, 0, 2)
+        counts[keys[grids.tobytes()]] += 1
     assert weights.sum() == pytest.approx(1.0)
     deviation = (counts - draws * weights) / np.sqrt(draws * weights)
     assert np.abs(deviation).max() < 5
