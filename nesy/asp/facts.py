@@ -12,6 +12,8 @@ from nesy.dbn.model import TwoSliceDBN
 
 SCALE = 1_000_000
 """Probability 1 as an integer weight."""
+LEAST = 1e-3
+"""Least probability that is written as a fact; what a row loses by that is the fact `dropped`."""
 
 VOCABULARY: dict[str, str] = {
     "factor(F)": "F is a factor, 0 to N-1",
@@ -23,7 +25,7 @@ VOCABULARY: dict[str, str] = {
     "row(A,F,X,V,W)": "under A, with the parents' values X (a tuple), F takes the value V with weight W",
     "likely(A,F,X,V)": "the most probable value of that row",
     "met(A,F,X,C)": "the row was met C times in experience (rows never met have C = 0)",
-    "dropped(A,F,X,W)": "the weight of the row's values that are below the least weight written, where there is any",
+    "dropped(A,F,X,W)": "the weight of the row's values that are too improbable to be written, rounded up",
     "taken(A,C)": "action A was taken C times in experience",
     "changed(A,F,C)": "in C of them the value of F changed",
     "view(I)": "I is a distinct view met in experience",
@@ -100,7 +102,7 @@ class Facts:
         table = self.dbn.probabilities if self.all_rows else self.dbn.probabilities[self.dbn.row_counts > 0]
         if not len(table):
             return 0.0
-        return float(np.where(np.round(table * SCALE) < 1, table, 0.0).sum(axis=1).max())
+        return float(np.where(table < LEAST, table, 0.0).sum(axis=1).max())
 
     def _book(self) -> Codebook:
         if self.codebook is not None:
@@ -133,9 +135,10 @@ class Facts:
             texts = self._contexts(rows, len(self.dbn.parents(a, i)))
             head = f"{kind}({action},{i},"
             if kind == "row":
-                weights = np.round(table[rows] * SCALE).astype(np.int64)
-                for row, value in zip(*(index.tolist() for index in np.nonzero(weights)), strict=True):
-                    yield f"{head}{texts[row]},{value},{weights[row, value]})."
+                index, values = np.nonzero(table[rows] >= LEAST)
+                weights = np.round(table[rows[index], values] * SCALE).astype(np.int64)
+                entries = zip(index.tolist(), values.tolist(), weights.tolist(), strict=True)
+                yield from (f"{head}{texts[row]},{value},{weight})." for row, value, weight in entries)
             elif kind == "likely":
                 for text, value in zip(texts, table[rows].argmax(axis=1).tolist(), strict=True):
                     yield f"{head}{text},{value})."
@@ -143,9 +146,10 @@ class Facts:
                 for text, count in zip(texts, counts[rows].tolist(), strict=True):
                     yield f"{head}{text},{count})."
             else:
-                left = SCALE - np.round(table[rows] * SCALE).sum(axis=1).astype(np.int64)
-                for index in np.flatnonzero(left > 0).tolist():
-                    yield f"{head}{texts[index]},{left[index]})."
+                small = np.where(table[rows] < LEAST, table[rows], 0.0).sum(axis=1)
+                left = np.ceil(small * SCALE).astype(np.int64)
+                for row in np.flatnonzero(left).tolist():
+                    yield f"{head}{texts[row]},{left[row]})."
 
     def _contexts(self, rows: np.ndarray, arity: int) -> list[str]:
         """The parents' values of some rows, as tuples."""

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nesy.dbn import storage
+from nesy.dbn.rows import unique_rows
 from nesy.errors import UserError
 
 if TYPE_CHECKING:
@@ -148,10 +149,8 @@ def distinct_views(views: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
     Returns:
         uint8 [V, v, v] in lexicographic order, int64 [n], int64 [V].
     """
-    flat = np.ascontiguousarray(views.reshape(len(views), -1))
-    keys = flat.view(np.dtype((np.void, flat.shape[1]))).reshape(-1)
-    _, first, index, counts = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
-    return views[first], index.reshape(-1), counts
+    first, index, counts = unique_rows(views.reshape(len(views), -1))
+    return views[first], index, counts
 
 
 def value_meanings(codebook: Codebook, num_values: int, most: int = 3) -> tuple[tuple[str, ...], ...]:

@@ -18,6 +18,7 @@ import numpy as np
 
 from nesy.dbn.codebook import Codebook, distinct_views, value_meanings
 from nesy.dbn.model import Parents, TwoSliceDBN
+from nesy.dbn.rows import unique_rows
 from nesy.errors import UserError
 
 if TYPE_CHECKING:
@@ -124,7 +125,8 @@ def with_counts(dbn: TwoSliceDBN, codes: np.ndarray, actions: np.ndarray, next_c
             start = dbn.offsets[a, i]
             rows = dbn.num_rows(a, i)
             counts[start : start + rows] = np.bincount(dbn.rows(a, i, now, later), minlength=rows)
-    met = np.unique(np.concatenate([codes, next_codes]).astype(np.uint8), axis=0)
+    every = np.concatenate([codes, next_codes]).astype(np.uint8)
+    met = every[unique_rows(every)[0]]
     tables = {**dbn.tables, "codes": met, "taken": taken, "changed": changed}
     return replace(dbn, row_counts=counts, tables=tables)
 

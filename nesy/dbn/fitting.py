@@ -9,6 +9,7 @@ import numpy as np
 
 from nesy.dbn.extraction import Marginals, marginals, with_counts
 from nesy.dbn.model import TwoSliceDBN, topological_order
+from nesy.dbn.rows import unique_rows
 from nesy.dbn.structure import Search, learn_parents
 from nesy.errors import UserError
 
@@ -49,9 +50,9 @@ def from_experience(
     parents: list[list[tuple[int, ...]]] = []
     tables: list[list[np.ndarray]] = []
     for a in range(number):
-        kinds, weights = np.unique(
-            np.column_stack([codes, next_codes])[np.asarray(actions) == a], axis=0, return_counts=True
-        )
+        both = np.column_stack([codes, next_codes])[np.asarray(actions) == a]
+        first, _, weights = unique_rows(both)
+        kinds = both[first]
         parents.append([])
         tables.append([])
         for i in range(n):
@@ -99,7 +100,8 @@ def from_callable(
     """
     search = search or Search()
     _check(np.asarray(codes), num_values)
-    kinds, weights = np.unique(codes, axis=0, return_counts=True)
+    first, _, weights = unique_rows(codes)
+    kinds = np.asarray(codes)[first]
     n = kinds.shape[1]
     number = len(action_names) if action_names is not None else num_actions or int(np.max(actions)) + 1
     parents: list[list[tuple[int, ...]]] = []

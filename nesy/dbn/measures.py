@@ -9,6 +9,7 @@ import numpy as np
 from nesy.dbn.extraction import Conditionals
 from nesy.dbn.factored import predict_batch
 from nesy.dbn.model import TwoSliceDBN
+from nesy.dbn.rows import unique_rows
 
 if TYPE_CHECKING:
     from nesy.dbn.extraction import Marginals, Transitions
@@ -79,14 +80,13 @@ def nll(dbn: TwoSliceDBN, codes: np.ndarray, actions: np.ndarray, next_codes: np
     Returns:
         `nll`, `nll_limit` (nats) and `impossible` (share of transitions with probability below 1e-12).
     """
-    kinds, counts = np.unique(
-        np.column_stack([codes, actions.astype(np.uint8), next_codes]), axis=0, return_counts=True
-    )
+    every = np.column_stack([codes, actions, next_codes]).astype(np.uint8)
+    first, _, counts = unique_rows(every)
+    kinds = every[first]
     n = dbn.num_factors
     logs = dbn.log_prob(kinds[:, :n], kinds[:, n], kinds[:, n + 1 :])
     weights = counts / counts.sum()
-    _, context = np.unique(kinds[:, : n + 1], axis=0, return_inverse=True)
-    context = context.reshape(-1)
+    _, context, _ = unique_rows(kinds[:, : n + 1])
     totals = np.bincount(context, weights=counts)
     return {
         "nll": float(-(weights * np.maximum(logs, np.log(FLOOR))).sum()),

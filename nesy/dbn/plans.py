@@ -13,6 +13,7 @@ import numpy as np
 
 from nesy.dbn.inference import ancestors
 from nesy.dbn.model import TwoSliceDBN
+from nesy.dbn.rows import unique_rows
 from nesy.errors import UserError
 
 MAX_CODES = 1 << 21
@@ -81,9 +82,8 @@ def _merged(
     now: np.ndarray, later: np.ndarray, weights: np.ndarray, num_values: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     both = np.column_stack([now, later]).astype(np.uint8)
-    keys = np.ascontiguousarray(both).view(np.dtype((np.void, both.shape[1]))).reshape(-1)
-    _, first, index = np.unique(keys, return_index=True, return_inverse=True)
-    return now[first], later[first], np.bincount(index.reshape(-1), weights)
+    first, index, _ = unique_rows(both)
+    return now[first], later[first], np.bincount(index, weights)
 
 
 def pruned(dbn: TwoSliceDBN, least: float) -> tuple[TwoSliceDBN, float]:

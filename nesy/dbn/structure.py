@@ -19,6 +19,7 @@ from typing import Literal
 
 import numpy as np
 
+from nesy.dbn.rows import unique_rows
 from nesy.errors import UserError
 
 Score = Literal["bdeu", "bic", "aic"]
@@ -70,8 +71,8 @@ def learn_parents(
     split, total = limits
     known: dict[tuple[int, ...], float] = {}
     # equal combinations of candidates are merged once, so that every score works on few rows
-    merged, index = np.unique(candidates, axis=0, return_inverse=True)
-    index = index.reshape(-1)
+    first, index, _ = unique_rows(candidates)
+    merged = candidates[first]
     counts = np.stack(
         [np.bincount(index, weights * child[:, k], minlength=len(merged)) for k in range(num_values)], axis=1
     )

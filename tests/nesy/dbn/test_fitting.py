@@ -151,3 +151,18 @@ def test_extract_needs_initial_codes_that_exist():
             *(np.zeros((1, 3), dtype=np.uint8), np.zeros(1, dtype=int), np.zeros((1, 3), dtype=np.uint8)),
             initial_codes=np.zeros((0, 3), dtype=np.uint8),
         )
+
+
+@pytest.mark.parametrize("width", [0, 1, 3, 8, 9, 25])
+def test_distinct_rows_are_numpy_s(width):
+    from nesy.dbn.rows import unique_rows
+
+    table = np.random.default_rng(width).integers(0, 2 + 254 * (width < 3), size=(300, width)).astype(np.uint8)
+    first, index, counts = unique_rows(table)
+    if width:
+        rows, wanted_index, wanted_counts = np.unique(table, axis=0, return_inverse=True, return_counts=True)
+        np.testing.assert_array_equal(table[first], rows)
+        np.testing.assert_array_equal(index, wanted_index.reshape(-1))
+        np.testing.assert_array_equal(counts, wanted_counts)
+    else:
+        assert counts.tolist() == [300]
