@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nesy.dbn.extraction import Conditionals
-from nesy.dbn.factored import predict_batch
+from nesy.dbn.factored import FactoredUpdates, predict_batch
+from nesy.dbn.kernels import packed, sample_codes
 from nesy.dbn.model import TwoSliceDBN
 from nesy.dbn.rows import unique_rows
 
@@ -31,7 +32,9 @@ def fidelity(dbn: TwoSliceDBN, model: Conditionals | Marginals | None, transitio
         1e-12, their share is `impossible`), `nll_limit`: the least that any model can have on the same
         transitions; `max_difference_to_network`: over every entry of every table where the network has
         tables, else of the predicted marginals of every code met; `rows`, `rows_met`,
-        `max_parents`, `next_arcs` (arcs within slice t+1), `codes_met`.
+        `max_parents`, `next_arcs` (arcs within slice t+1), `codes_met`, `views_met`; `row_tv`, `row_kl`: total
+        variation and KL divergence of the rows from the frequencies in the data, weighted by visits;
+        `unknown_code_rate`: how often the table leads from a code met to a code that no view met has.
     """
     figures: dict[str, Any] = {
         "rows": len(dbn.probabilities),
@@ -42,6 +45,8 @@ def fidelity(dbn: TwoSliceDBN, model: Conditionals | Marginals | None, transitio
         "views_met": len(transitions.views),
     }
     figures |= nll(dbn, transitions.codes, transitions.actions, transitions.next_codes)
+    figures |= row_differences(dbn, transitions.codes, transitions.actions, transitions.next_codes)
+    figures["unknown_code_rate"] = unknown_code_rate(dbn, np.unique(transitions.view_codes, axis=0))
     if isinstance(model, Conditionals):
         figures["max_difference_to_network"] = max_difference(dbn, model)
     elif model is not None:
@@ -93,3 +98,84 @@ def nll(dbn: TwoSliceDBN, codes: np.ndarray, actions: np.ndarray, next_codes: np
         "nll_limit": float(max(0.0, -(weights * np.log(counts / totals[context])).sum())),
         "impossible": float(weights[logs < np.log(FLOOR)].sum()),
     }
+
+
+def row_differences(
+    dbn: TwoSliceDBN, codes: np.ndarray, actions: np.ndarray, next_codes: np.ndarray
+) -> dict[str, float]:
+    """How far the rows are from the frequencies in some transitions, weighted by visits.
+
+    Returns:
+        `row_tv` and `row_kl` (KL from frequencies to row, nats; probabilities below 1e-12 count as 1e-12).
+    """
+    k = dbn.num_values
+    distance = divergence = total = 0.0
+    for a in range(dbn.num_actions):
+        chosen = actions == a
+        now, later = codes[chosen].astype(np.int64), next_codes[chosen].astype(np.int64)
+        for i in range(dbn.num_factors):
+            cell = dbn.rows(a, i, now, later) * k + later[:, i]
+            counts = np.bincount(cell, minlength=dbn.num_rows(a, i) * k).reshape(-1, k)
+            visits = counts.sum(axis=1)
+            met = visits > 0
+            row, frequency = dbn.cpt(a, i)[met], counts[met] / visits[met, None]
+            logs = np.log(np.where(frequency > 0, frequency, 1.0)) - np.log(np.maximum(row, FLOOR))
+            distance += float((visits[met] * 0.5 * np.abs(frequency - row).sum(axis=1)).sum())
+            divergence += float((visits[met, None] * frequency * logs).sum())
+            total += float(visits.sum())
+    return {"row_tv": distance / max(total, 1.0), "row_kl": max(0.0, divergence / max(total, 1.0))}
+
+
+def unknown_code_rate(dbn: TwoSliceDBN, known: np.ndarray, samples: int = 20_000, seed: int = 0) -> float:
+    """How often one step from a known code, under a random action, leads to a code that is not known.
+
+    Args:
+        dbn: the model.
+        known: uint8 [C, N], distinct codes; all equally likely to be left.
+        samples: steps drawn.
+        seed: of the draws.
+    """
+    rng = np.random.default_rng(seed)
+    codes = known[rng.integers(len(known), size=samples)]
+    later = dbn.sample(codes, rng.integers(dbn.num_actions, size=samples), rng)
+    _, index, _ = unique_rows(np.concatenate([known, later]))
+    return float(1.0 - np.isin(index[len(known) :], index[: len(known)]).mean())
+
+
+def rollout_drift(
+    dbn: TwoSliceDBN, codes: np.ndarray, rng: np.random.Generator, steps: int = 8, starts: int = 16, samples: int = 4000
+) -> dict[str, Any]:
+    """How far rollouts of marginals (factors taken as independent after each step) drift from the model.
+
+    From random known codes random plans are followed, once as a product of marginals and once by sampling
+    whole codes.
+
+    Args:
+        dbn: the model.
+        codes: uint8 [C, N], codes to start from.
+        rng: source of randomness.
+        steps: length of the plans.
+        starts: plans.
+        samples: codes drawn per plan.
+
+    Returns:
+        `total_variation`: mean over factors and plans after 1, 2, ... steps; `sampling_error`: what the same
+        figure would be, about, if there were no drift.
+    """
+    updates, tables = FactoredUpdates(dbn), packed(dbn)
+    k = dbn.num_values
+    first = codes[rng.integers(len(codes), size=starts)].astype(np.uint8)
+    plans = rng.integers(dbn.num_actions, size=(steps, starts))
+    beliefs = np.eye(k)[first]
+    drawn = np.repeat(first, samples, axis=0)
+    drift, error = [], []
+    for actions in plans:
+        beliefs = updates.predict(beliefs, actions)
+        drawn = sample_codes(tables, drawn, np.repeat(actions, samples), rng.random(drawn.shape))
+        one_hot = drawn.reshape(starts, samples, dbn.num_factors, 1) == np.arange(k)
+        frequency = one_hot.mean(axis=1)
+        drift.append(float(0.5 * np.abs(frequency - beliefs).sum(axis=2).mean()))
+        # mean absolute deviation of a frequency is about sqrt(2 p (1 - p) / (pi n))
+        spread = np.sqrt(2 * frequency * (1 - frequency) / (np.pi * samples))
+        error.append(float(0.5 * spread.sum(axis=2).mean()))
+    return {"total_variation": drift, "sampling_error": error}

@@ -1,0 +1,109 @@
+"""Pictures of the 2DBN, as PNG or SVG by the file's ending: its graph, and what the values of a factor look like."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from nesy.dbn.codebook import Codebook
+from nesy.dbn.graph import to_networkx
+from nesy.dbn.model import TwoSliceDBN
+from nesy.errors import UserError
+from nesy.run_folder import atomic_path
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLOURS = ("#f2f0e9", "#4a4e54", "#3c9a5f", "#c9c4b8")
+"""Of the cell kinds empty, wall, goal, unseen."""
+
+
+def draw_graph(dbn: TwoSliceDBN, path: Path | str, action: int | None = None) -> None:
+    """Draw the graph, one panel per action: slice t left, slice t+1 right, arrows as wide as they are strong.
+
+    Raises:
+        UserError: no such action, or an ending that is no picture format.
+    """
+    from matplotlib.figure import Figure
+
+    if action is not None and not 0 <= action < dbn.num_actions:
+        raise UserError(f"no action {action}; the actions are {', '.join(dbn.action_names)}")
+    chosen = range(dbn.num_actions) if action is None else (action,)
+    figure = Figure(figsize=(3.4 * len(chosen), 0.55 * dbn.num_factors + 1.2), layout="constrained")
+    axes = figure.subplots(1, len(chosen), squeeze=False)[0]
+    for a, axis in zip(chosen, axes, strict=True):
+        _panel(dbn, a, axis)
+    _save(figure, path)
+
+
+def _panel(dbn: TwoSliceDBN, action: int, axis: Axes) -> None:
+    import networkx
+
+    graph = to_networkx(dbn, action)
+    places = {node: (float(data["slice"]), -float(data["factor"])) for node, data in graph.nodes(data=True)}
+    networkx.draw_networkx_nodes(graph, places, ax=axis, node_size=420, node_color="#ffffff", edgecolors="#4a4e54")
+    networkx.draw_networkx_labels(graph, places, ax=axis, font_size=8)
+    for source, target, data in graph.edges(data=True):
+        inside = graph.nodes[source]["slice"] == 1
+        networkx.draw_networkx_edges(
+            graph,
+            places,
+            ax=axis,
+            edgelist=[(source, target)],
+            width=0.3 + 2.7 * data["strength"],
+            edge_color="#b5651d" if inside else "#3a6ea5",
+            connectionstyle="arc3,rad=0.45" if inside else "arc3,rad=0.0",
+            node_size=420,
+            arrowsize=8,
+        )
+    axis.set_title(dbn.action_names[action], fontsize=10)
+    axis.set_xlim(-0.25, 1.45)
+    axis.axis("off")
+
+
+def draw_factor(dbn: TwoSliceDBN, codebook: Codebook, factor: int, path: Path | str) -> None:
+    """Draw what each value of a factor looks like: the mean of the views that have it, and what it means.
+
+    Each cell is the mean colour of its kinds over those views; how many they are stands below.
+
+    Raises:
+        UserError: no such factor, or an ending that is no picture format.
+    """
+    from matplotlib.figure import Figure
+
+    if not 0 <= factor < dbn.num_factors:
+        raise UserError(f"no factor {factor}; the factors are 0 to {dbn.num_factors - 1}")
+    figure = Figure(figsize=(1.6 * dbn.num_values, 2.6), layout="constrained")
+    axes = figure.subplots(1, dbn.num_values, squeeze=False)[0]
+    for value, axis in enumerate(axes):
+        chosen = codebook.codes[:, factor] == value
+        axis.set_xticks([])
+        axis.set_yticks([])
+        axis.set_title(f"{dbn.factor_names[factor]} = {value}", fontsize=9)
+        if chosen.any():
+            # views are indexed [vx, vy]; pictures have the row first
+            axis.imshow(mean_view(codebook.views[chosen]).transpose(1, 0, 2))
+            meaning = dbn.value_meanings[factor][value] if dbn.value_meanings else ""
+            axis.set_xlabel(f"{int(chosen.sum())} views\n" + "\n".join(meaning.split(", ")), fontsize=6)
+        else:
+            axis.set_xlabel("not met", fontsize=6)
+    figure.suptitle(f"Values of {dbn.factor_names[factor]}", fontsize=10)
+    _save(figure, path)
+
+
+def mean_view(views: np.ndarray) -> np.ndarray:
+    """Mean colours float64 [v, v, 3] of some views uint8 [n, v, v]."""
+    palette = np.array([[int(c[j : j + 2], 16) for j in (1, 3, 5)] for c in COLOURS]) / 255.0
+    return np.asarray(palette[views].mean(axis=0))
+
+
+def _save(figure: Figure, path: Path | str) -> None:
+    path = Path(path)
+    kind = path.suffix.lower().lstrip(".")
+    if kind not in ("png", "svg"):
+        raise UserError(f"{path}: pictures are written as .png or .svg")
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format=kind, dpi=150)
