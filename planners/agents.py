@@ -111,6 +111,6 @@ class PlanningAgent:
             from planners.pomdp_py_adapter import POUCTAgent
 
             return POUCTAgent(self.model, self.compiled, self.config, rng)
-        from planners.search import IALMSearch
+        from planners.ialm_search import IALMSearch
 
         return IALMSearch(self.model, self.compiled, self.config, rng)

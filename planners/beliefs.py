@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from planners import kernels
-from planners.ialm import IALM
+from planners.ialm import IALM, SCALARS
 from planners.kernels import Model
 from planners.random_bits import stream, uniform
 
@@ -146,7 +146,7 @@ def _advance(
     after: np.ndarray,
     bits: np.ndarray,
 ) -> np.ndarray:
-    variables = np.zeros(3 * model.dbn.order.shape[0] + 17, np.int16)
+    variables = np.zeros(3 * model.dbn.order.shape[0] + len(SCALARS), np.int16)
     weights = np.zeros(states.shape[0])
     for p in range(states.shape[0]):
         weights[p] = kernels.explain_step(model, states[p], action, code, seen, after[p], variables, bits)
@@ -155,7 +155,7 @@ def _advance(
 
 @njit(cache=True)
 def _predict(model: Model, states: np.ndarray, action: int, after: np.ndarray, bits: np.ndarray) -> None:
-    variables = np.zeros(3 * model.dbn.order.shape[0] + 17, np.int16)
+    variables = np.zeros(3 * model.dbn.order.shape[0] + len(SCALARS), np.int16)
     for p in range(states.shape[0]):
         kernels.step(model, states[p], action, after[p], variables, bits)
 

@@ -39,9 +39,9 @@ from planners.tables import DecisionTable, PackedTables, pack
 if TYPE_CHECKING:
     from nesy.experience import Experience
 
-TABLES = ("moved", "waits", "influence", "next_waiting", "next_lost", "visible", "outcome", "reward")
+TABLES = ("moved", "waits", "influence", "next_waiting", "distance", "next_lost", "visible", "outcome", "reward")
 """The learned tables, in the order in which they are packed for kernels."""
-MOVED, WAITS, INFLUENCE, NEXT_WAITING, NEXT_LOST, VISIBLE, OUTCOME, REWARD = range(len(TABLES))
+MOVED, WAITS, INFLUENCE, NEXT_WAITING, DISTANCE, NEXT_LOST, VISIBLE, OUTCOME, REWARD = range(len(TABLES))
 
 SCALARS = (
     "action",
@@ -58,6 +58,7 @@ SCALARS = (
     "next_heading",
     "waiting",
     "lost",
+    "distance",
     "next_lost",
     "visible",
     "outcome",
@@ -78,12 +79,15 @@ SCALARS = (
     NEXT_HEADING,
     IS_WAITING,
     LOST_COUNT,
+    THE_DISTANCE,
     NEXT_LOST_COUNT,
     IS_VISIBLE,
     THE_OUTCOME,
 ) = range(len(SCALARS))
 FORWARD, STAY = 2, 3
 WAIT = 3
+MAX_DISTANCE = 15
+"""Distances from here on count as one."""
 TIMEOUT = 5
 """An ending by the clock; the model has no clock, so such a step counts as an ordinary one."""
 

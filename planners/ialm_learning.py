@@ -10,14 +10,14 @@ from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
 from planners import ialm
 from planners.bounds import relational_values
-from planners.ialm import FORWARD, IALM, SCALARS, STAY, TIMEOUT, WAIT, Codec
+from planners.ialm import FORWARD, IALM, MAX_DISTANCE, SCALARS, STAY, TIMEOUT, WAIT, Codec
 from planners.motion import RelativeMotion, learn_motion
 from planners.tables import DecisionTable, Parents, learn_distribution, learn_mean
 
 if TYPE_CHECKING:
     from nesy.experience import Experience
 
-_ORDERED = {"side", "ahead", "waiting", "lost"}
+_ORDERED = {"side", "ahead", "waiting", "lost", "distance"}
 
 
 def learn_ialm(
@@ -68,7 +68,7 @@ def learn_ialm(
     variables[followed, 3 * n + ialm.NEXT_LOST_COUNT] = next_lost[followed]
     # Where the episode ended there is no next counter to read; the table learned from the others fills it in.
     lost_table = learn_distribution(
-        variables[followed], parents("lost", "next", "next_x"), next_lost[followed], int(next_lost.max()) + 2
+        variables[followed], parents("lost", "distance", "next"), next_lost[followed], int(next_lost.max()) + 2
     )
     ended = ~followed
     estimated = lost_table.estimates()[lost_table.locate(variables[ended])].argmax(axis=1)
@@ -80,19 +80,22 @@ def learn_ialm(
         "next_waiting": learn_distribution(
             variables[followed], parents("waiting", "person"), next_waiting[followed], int(next_waiting.max()) + 1
         ),
+        "distance": learn_distribution(
+            variables, parents("next", "next_x"), column(ialm.THE_DISTANCE).astype(np.int64), MAX_DISTANCE + 1
+        ),
         "next_lost": lost_table,
         "visible": learn_distribution(
             variables, parents("next", "next_x"), (following.next_configuration > 0).astype(np.int64), 2
         ),
         "outcome": learn_distribution(
             variables,
-            parents("action", "motion", "person", "c", "next", "visible", "next_lost", "lost", "x", "y"),
+            parents("action", "motion", "person", "c", "next", "visible", "distance", "next_lost", "lost", "x", "y"),
             outcome,
             int(outcome.max()) + 1,
         ),
         "reward": learn_mean(
             variables,
-            parents("action", "motion", "next", "visible", "next_lost", "outcome", "next_x"),
+            parents("action", "motion", "next", "visible", "distance", "next_lost", "outcome"),
             following.reward,
         ),
     }
@@ -135,6 +138,7 @@ def _variables(
         ialm.PERSON: experience.person_action,
         ialm.IS_WAITING: experience.waiting,
         ialm.LOST_COUNT: experience.lost,
+        ialm.THE_DISTANCE: np.rint(experience.distance).clip(0, MAX_DISTANCE),
         ialm.IS_VISIBLE: experience.next_configuration > 0,
         ialm.THE_OUTCOME: outcome,
     }

@@ -165,6 +165,7 @@ def finish(model: Model, v: np.ndarray, after: np.ndarray, rng: np.ndarray) -> t
     """Complete a step whose motions, x' and c' are in `v`: counters, y', sight, outcome, reward, next state."""
     n = model.dbn.order.shape[0]
     b = 3 * n
+    v[b + ialm.THE_DISTANCE] = draw(model.tables, ialm.DISTANCE, v, rng)
     v[b + ialm.NEXT_LOST_COUNT] = draw(model.tables, ialm.NEXT_LOST, v, rng)
     v[b + ialm.IS_VISIBLE] = draw(model.tables, ialm.VISIBLE, v, rng)
     outcome = draw(model.tables, ialm.OUTCOME, v, rng)
@@ -241,6 +242,7 @@ def explain_step(
             visible = 1 if seen[2] >= 0 else 0
             v[b + ialm.IS_VISIBLE] = visible
             weight *= chance(model.tables, ialm.VISIBLE, v, visible)
+            v[b + ialm.THE_DISTANCE] = draw(model.tables, ialm.DISTANCE, v, rng)
             v[b + ialm.NEXT_LOST_COUNT] = draw(model.tables, ialm.NEXT_LOST, v, rng)
             weight *= chance(model.tables, ialm.OUTCOME, v, 0)
             weights[4 * stays + person] = weight

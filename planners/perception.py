@@ -9,16 +9,14 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from nesy.perspective import BeliefCodec, InfluenceBelief
 
-class Codec(Protocol):
-    """What turns views into codes and beliefs: `nesy.world_model.SymbolicCodec`."""
+
+class Codec(BeliefCodec, Protocol):
+    """What turns views into codes and beliefs, and Φ needs: `nesy.world_model.SymbolicCodec`."""
 
     def codes(self, views: np.ndarray) -> np.ndarray:
         """uint8 [B, V, V] -> uint8 [B, N]."""
-        ...
-
-    def beliefs(self, views: np.ndarray) -> np.ndarray:
-        """uint8 [B, V, V] -> float32 [B, N, K]."""
         ...
 
 
@@ -42,8 +40,6 @@ class Perception:
     """Turns observations into percepts under one influence mode."""
 
     def __init__(self, codec: Codec, influence: str, rng: np.random.Generator) -> None:
-        from nesy.perspective import InfluenceBelief
-
         self.codec, self.influence = codec, influence
         self._shift = InfluenceBelief(influence, codec, rng)
 

@@ -169,6 +169,7 @@ def _learn(variables: np.ndarray, parents: Parents, moments: np.ndarray, kind: s
     columns = np.ascontiguousarray(variables[:, list(parents.slots)].T.astype(np.int32))
     if columns.min() < 0:
         raise ValueError("the parents of a table must be non-negative integers")
+    columns, moments = _collapsed(columns, moments)
     sizes = columns.max(axis=1).astype(np.int64) + 1
     questions = sum(
         int(size) * (2 if is_ordered else 1) for size, is_ordered in zip(sizes, parents.ordered, strict=True)
@@ -185,6 +186,21 @@ def _learn(variables: np.ndarray, parents: Parents, moments: np.ndarray, kind: s
     slot = np.where(slot >= 0, slots[np.maximum(slot, 0)], -1).astype(np.int32)
     names = dict(zip(parents.slots, parents.names, strict=True))
     return DecisionTable(slot, value, ordered, yes, no, node_moments, kind, names)
+
+
+def _collapsed(columns: np.ndarray, moments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Add up the examples whose parents agree: columns int32 [F, n] -> [F, m], moments [n, M] -> [m, M]."""
+    sizes = columns.max(axis=1).astype(object) + 1
+    if int(np.prod(sizes)) < 2**62:
+        keys = np.zeros(columns.shape[1], np.int64)
+        for column, size in zip(columns, sizes, strict=True):
+            keys = keys * int(size) + column
+        _, first, group = np.unique(keys, return_index=True, return_inverse=True)
+    else:
+        _, first, group = np.unique(columns.T, axis=0, return_index=True, return_inverse=True)
+    group = group.reshape(-1)
+    summed = np.stack([np.bincount(group, moment, len(first)) for moment in moments.T], axis=1)
+    return np.ascontiguousarray(columns[:, first]), summed
 
 
 @njit(cache=True)

@@ -1,0 +1,133 @@
+"""A search tree in flat arrays, and the few operations that every search here is made of.
+
+Nodes are beliefs, edges (action, observation). Node i has Q-values at q_value[i], visit counts at q_visits[i];
+the child reached by (i, action, observation) is found through an open-addressing hash table, so observations
+need no numbering and cost nothing before they occur. Actions are tried in their fixed order.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+_EMPTY = np.int64(-1)
+_MULTIPLIER = np.uint64(0x9E3779B97F4A7C15)
+
+
+class Tree(NamedTuple):
+    """The arrays of one tree.
+
+    Attributes:
+        size: int64 [1], nodes in use.
+        visits: int64 [capacity].
+        q_visits: int64 [capacity, A].
+        q_value: float64 [capacity, A], mean return of the action.
+        depth: int32 [capacity], depth of the node below the root it was made under.
+        key, owner, child: the hash table: observation, node * A + action (-1 if empty), node reached.
+    """
+
+    size: np.ndarray
+    visits: np.ndarray
+    q_visits: np.ndarray
+    q_value: np.ndarray
+    depth: np.ndarray
+    key: np.ndarray
+    owner: np.ndarray
+    child: np.ndarray
+
+
+def allocate(capacity: int, num_actions: int) -> Tree:
+    """An empty tree for at most `capacity` nodes, with its root (node 0) in place."""
+    slots = 1 << int(np.ceil(np.log2(max(2 * capacity, 16))))
+    return Tree(
+        np.ones(1, np.int64),
+        np.zeros(capacity, np.int64),
+        np.zeros((capacity, num_actions), np.int64),
+        np.zeros((capacity, num_actions)),
+        np.zeros(capacity, np.int32),
+        np.zeros(slots, np.int64),
+        np.full(slots, _EMPTY),
+        np.zeros(slots, np.int64),
+    )
+
+
+@njit(cache=True)
+def clear(tree: Tree) -> None:
+    """Forget everything; the root is node 0 again."""
+    used = tree.size[0]
+    for node in range(used):
+        tree.visits[node] = 0
+        tree.depth[node] = 0
+        for a in range(tree.q_value.shape[1]):
+            tree.q_visits[node, a] = 0
+            tree.q_value[node, a] = 0.0
+    for slot in range(tree.owner.shape[0]):
+        tree.owner[slot] = -1
+    tree.size[0] = 1
+
+
+@njit(cache=True)
+def best_by_ucb(tree: Tree, node: int, exploration: float, allowed: np.ndarray) -> int:
+    """The action with the highest upper confidence bound (UCB1); untried allowed actions first, in order."""
+    num_actions = tree.q_value.shape[1]
+    logarithm = np.log(tree.visits[node] + 1.0)
+    best, best_score = -1, -np.inf
+    for a in range(num_actions):
+        if not allowed[a]:
+            continue
+        visits = tree.q_visits[node, a]
+        if visits == 0:
+            return a
+        score = tree.q_value[node, a] + exploration * np.sqrt(logarithm / visits)
+        if score > best_score:
+            best, best_score = a, score
+    return best
+
+
+@njit(cache=True)
+def find_child(tree: Tree, node: int, action: int, observation: int, add: bool) -> int:
+    """The child of `node` by (action, observation).
+
+    With `add`, a missing child is made; the answer is then -(index) - 1. Otherwise a missing child, or one that
+    no longer fits into the tree, is answered with the smallest integer.
+    """
+    num_actions = tree.q_value.shape[1]
+    owner = node * num_actions + action
+    mask = np.uint64(tree.owner.shape[0] - 1)
+    mixed = (np.uint64(owner) * _MULTIPLIER) ^ np.uint64(observation)
+    mixed = (mixed ^ (mixed >> np.uint64(29))) * _MULTIPLIER
+    slot = (mixed ^ (mixed >> np.uint64(32))) & mask
+    while tree.owner[slot] != -1:
+        if tree.owner[slot] == owner and tree.key[slot] == observation:
+            return tree.child[slot]
+        slot = (slot + np.uint64(1)) & mask
+    if not add or tree.size[0] >= tree.visits.shape[0]:
+        return -9223372036854775807
+    made = tree.size[0]
+    tree.size[0] = made + 1
+    tree.owner[slot], tree.key[slot], tree.child[slot] = owner, observation, made
+    tree.depth[made] = tree.depth[node] + 1
+    return -made - 1
+
+
+@njit(cache=True)
+def backup(
+    tree: Tree,
+    nodes: np.ndarray,
+    actions: np.ndarray,
+    rewards: np.ndarray,
+    length: int,
+    leaf_value: float,
+    discount: float,
+) -> float:
+    """Add one simulation: average its discounted return into the Q-values along its path; the root's return."""
+    value = leaf_value
+    for d in range(length - 1, -1, -1):
+        value = rewards[d] + discount * value
+        node, action = nodes[d], actions[d]
+        tree.visits[node] += 1
+        tree.q_visits[node, action] += 1
+        tree.q_value[node, action] += (value - tree.q_value[node, action]) / tree.q_visits[node, action]
+    return value
