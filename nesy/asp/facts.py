@@ -132,7 +132,7 @@ class Facts:
         for action, a, i in self._tables():
             counts, table = self.dbn.counts(a, i), self.dbn.cpt(a, i)
             rows = np.arange(len(table)) if self.all_rows else np.flatnonzero(counts)
-            texts = self._contexts(rows, len(self.dbn.parents(a, i)))
+            texts = self.contexts(rows, len(self.dbn.parents(a, i)))
             head = f"{kind}({action},{i},"
             if kind == "row":
                 index, values = np.nonzero(table[rows] >= LEAST)
@@ -151,7 +151,7 @@ class Facts:
                 for row in np.flatnonzero(left).tolist():
                     yield f"{head}{texts[row]},{left[row]})."
 
-    def _contexts(self, rows: np.ndarray, arity: int) -> list[str]:
+    def contexts(self, rows: np.ndarray, arity: int) -> list[str]:
         """The parents' values of some rows, as tuples."""
         k = self.dbn.num_values
         if arity == 0:
