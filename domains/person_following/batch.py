@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from domains.person_following.random_numbers import seeded_stream
 from domains.person_following.store import shared_store
 from domains.person_following.variants import CYCLED, DRAWN, GENERATED, Parameters, parameters_of
 from domains.person_following.world import (
+    EPISODE,
     HEADING,
     LOST,
     TIME,
@@ -98,17 +100,21 @@ class Batch:
         return cells
 
     def seed(self, seeds: list[int]) -> None:
-        """Give environment i the random stream of `seeds[i]`."""
+        """Make environment i what a new one with `seeds[i]` is: a seed fixes all that follows.
+
+        So the waiting counter, which otherwise lives on from episode to episode, starts at 0 too.
+        """
         for i, seed in enumerate(seeds):
             self.world.stream[i] = seeded_stream(seed)
-        self.world.robot[:, kernel.EPISODE] = 0
+        self.world.robot[:, EPISODE] = 0
+        self.world.person[:, WAITING] = 0
         self.seeded = True
 
-    def begin(self, options: dict[str, Any] | None) -> None:
-        """Begin new episodes everywhere, on a given grid and with a given waiting counter if `options` say so.
+    def checked_options(self, options: dict[str, Any] | None) -> Callable[[], None]:
+        """What begins new episodes everywhere, on a given grid and with a given waiting counter if so wished.
 
         Raises:
-            DomainError: an unknown option or a bad value; the state is then as it was.
+            DomainError: an unknown option or a bad value; nothing has changed then.
         """
         given = dict(options or {})
         unknown = sorted(set(given) - {"grid", "waiting"})
@@ -120,6 +126,9 @@ class Batch:
             isinstance(waiting, bool) or not isinstance(waiting, int | np.integer) or not 0 <= waiting <= 2
         ):
             raise DomainError(f"option 'waiting' must be 0, 1 or 2, got {waiting!r}")
+        return lambda: self._begin(grid, None if waiting is None else int(waiting))
+
+    def _begin(self, grid: NDArray[np.uint8] | None, waiting: int | None) -> None:
         if grid is not None:
             self.world.grid[:] = grid
         everywhere = np.ones(self.num_envs, np.bool_)
@@ -134,7 +143,14 @@ class Batch:
     def step(self, actions: NDArray[np.int64], autoreset: bool) -> None:
         """Take a step everywhere; the results lie in `last`, which is new every time."""
         self.last = allocate_results(self.num_envs, self.parameters.view_size)
-        kernel.step_batch(self.rules, self.world, self.store, self.maps, actions, autoreset, self.last)
+        last = self.last
+        ended = kernel.step_batch(self.rules, self.world, self.store, actions, last)
+        if autoreset and ended:
+            last.robot_view[:] = last.final_view
+            last.configuration[:] = last.final_configuration
+            kernel.begin_batch(self.rules, self.world, self.store, self.maps, last.ended, False, last)
+        else:
+            self.last = last._replace(robot_view=last.final_view, configuration=last.final_configuration)
 
     def describe(self) -> tuple[NDArray[np.uint8], NDArray[np.int16], NDArray[np.int16]]:
         """Person views, relative poses and counters of the present states; crossing has no person."""

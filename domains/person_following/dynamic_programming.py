@@ -13,10 +13,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from domains.core import FORWARD, GOAL, STAY
+from domains.person_following.compiled import entry, inner
 from domains.person_following.paths import step_x, step_y
 from domains.person_following.person_chain import PersonChain
 from domains.person_following.variants import (
@@ -71,7 +71,7 @@ def step_tables(chain: PersonChain, parameters: Parameters) -> StepTables:
     )
 
 
-@njit(cache=True)
+@entry
 def reachable_states(rules, successors, reached):  # type: ignore[no-untyped-def]
     """Mark in `reached` [T, P, W] the person states and waiting counters in which a step t can begin."""
     for w in range(reached.shape[2]):
@@ -91,7 +91,7 @@ def reachable_states(rules, successors, reached):  # type: ignore[no-untyped-def
                 reached[t + 1, successors[p, 1], 0] = True
 
 
-@njit(cache=True)
+@inner
 def _arrive(rules, tables, reached, discount, t, value, total, success, arrive):  # type: ignore[no-untyped-def]
     """Fill `arrive` [3, P, W, C, G, L]: what arriving in a state at the end of step t is worth."""
     reward, _, far, won, _, _, _, _, at_goal = tables
@@ -127,7 +127,7 @@ def _arrive(rules, tables, reached, discount, t, value, total, success, arrive):
                         arrive[2, p, w, c, g, l] = s
 
 
-@njit(cache=True)
+@entry
 def sweep_backward(rules, tables, reached, discount, policy, value, total, success):  # type: ignore[no-untyped-def]
     """Fill `policy` [T, P, W, C, G, L]; tables [2, P, W, C, G, L] end with t = 0 in their first half.
 
@@ -193,7 +193,7 @@ def sweep_backward(rules, tables, reached, discount, policy, value, total, succe
                             success[now, p, w, c, g, l] = s
 
 
-@njit(cache=True)
+@entry
 def follow_policy(rules, tables, policy, start, states, actions):  # type: ignore[no-untyped-def]
     """Collect the states [n, 6] that the policy reaches from `start` at t = 0, and its actions [n]; returns n.
 

@@ -6,10 +6,10 @@ import itertools
 from fractions import Fraction
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from domains.core import EMPTY, GOAL, WALL, DomainError
+from domains.person_following.compiled import entry, inner
 from domains.person_following.paths import step_x, step_y
 from domains.person_following.variants import Parameters
 from domains.person_following.views import look
@@ -111,7 +111,7 @@ def all_transitions(
     return places, views[0], actions, views[1]
 
 
-@njit(cache=True)
+@inner
 def _collect_transitions(grids, see_through_walls, places, before, actions, after):  # type: ignore[no-untyped-def]
     count = 0
     for m in range(grids.shape[0]):
@@ -134,7 +134,7 @@ def _collect_transitions(grids, see_through_walls, places, before, actions, afte
                         count += 1
 
 
-@njit(cache=True)
+@entry
 def _collect_views(grids, see_through_walls, views):  # type: ignore[no-untyped-def]
     count = 0
     for m in range(grids.shape[0]):

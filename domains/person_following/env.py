@@ -50,21 +50,20 @@ class PersonFollowingEnv(gymnasium.Env):
         """Begin an episode.
 
         Args:
-            seed: seeds the environment's generator; None goes on with the present one.
+            seed: makes the environment as good as new, with this seed; None goes on with the present generator.
             options: `grid` [size, size] (0 empty, 1 wall, 2 goal) to start on, `waiting` (0..2) to start with.
 
         Raises:
             DomainError: a grid that cannot be played, or an unknown option; the state is then as it was.
         """
         batch = self.batch
-        kept = batch.world.stream[0].copy()
+        begin = batch.checked_options(options)
         super().reset(seed=seed)
-        batch.world.stream[0] = stream_of(self.np_random)
-        try:
-            batch.begin(options)
-        except ValueError:
-            batch.world.stream[0] = kept
-            raise
+        if seed is not None:
+            batch.seed([seed])
+        else:
+            batch.world.stream[0] = stream_of(self.np_random)
+        begin()
         write_back(batch.world.stream[0], self.np_random)
         last = batch.last
         observation = {"view": last.robot_view[0].copy(), "configuration": last.configuration[0]}

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from domains.core import EMPTY, GOAL, WALL
+from domains.person_following.compiled import entry
 from domains.person_following.random_numbers import draw_below, shuffle
 
 MAX_SIZE = 31
 _MAX_RIVERS = MAX_SIZE
 
 
-@njit(cache=True)
+@entry
 def generate_crossing(streams, grids, b, num_crossings):  # type: ignore[no-untyped-def]
     """Fill `grids[b]` with a new crossing map; the goal is at (size-2, size-2).
 

@@ -11,10 +11,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from domains.core import WALL
+from domains.person_following.compiled import entry, inner
 
 HEADING_NEVER, HEADING_ALWAYS, HEADING_UNLESS_0 = 0, 1, 2
 """When a path must end in the target's heading; the last is the quirk of the `paper` variant."""
@@ -44,19 +44,19 @@ def allocate_scratch(size: int) -> Scratch:
     )
 
 
-@njit(cache=True)
+@entry
 def step_x(heading):  # type: ignore[no-untyped-def]
     """Change of x by one step forward."""
     return 1 if heading == 0 else (-1 if heading == 2 else 0)
 
 
-@njit(cache=True)
+@entry
 def step_y(heading):  # type: ignore[no-untyped-def]
     """Change of y by one step forward."""
     return 1 if heading == 1 else (-1 if heading == 3 else 0)
 
 
-@njit(cache=True)
+@inner
 def _push(heap, count, key):  # type: ignore[no-untyped-def]
     position = count
     while position > 0:
@@ -69,7 +69,7 @@ def _push(heap, count, key):  # type: ignore[no-untyped-def]
     return count + 1
 
 
-@njit(cache=True)
+@inner
 def _pop(heap, count):  # type: ignore[no-untyped-def]
     top = heap[0]
     count -= 1
@@ -90,7 +90,7 @@ def _pop(heap, count):  # type: ignore[no-untyped-def]
     return top, count
 
 
-@njit(cache=True)
+@entry
 def astar(grids, b, x, y, heading, goal_x, goal_y, goal_heading, compare, scratch):  # type: ignore[no-untyped-def]
     """A* from a pose to a cell; the actions go to `scratch.path`.
 
@@ -160,7 +160,7 @@ def astar(grids, b, x, y, heading, goal_x, goal_y, goal_heading, compare, scratc
     return NO_PATH
 
 
-@njit(cache=True)
+@inner
 def distance_field(grids, b, x, y, heading, compare, until, distances, scratch):  # type: ignore[no-untyped-def]
     """Breadth-first distances TO a pose, backward from it.
 

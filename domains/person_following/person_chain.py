@@ -11,10 +11,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from domains.core import FORWARD, LEFT, RIGHT, WALL
+from domains.person_following.compiled import entry
 from domains.person_following.paths import (
     HEADING_ALWAYS,
     HEADING_NEVER,
@@ -122,7 +122,7 @@ def person_chain(grid: NDArray[np.uint8], start: tuple[int, int, int], parameter
     )
 
 
-@njit(cache=True)
+@entry
 def _fill(  # type: ignore[no-untyped-def]
     grids, poses, pose_index, people, heading_rule, see_through, view, distance, configuration, moves, scratch
 ):

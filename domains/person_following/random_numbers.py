@@ -12,8 +12,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from domains.person_following.compiled import inner
 
 STREAM_WIDTH = 6
 
@@ -64,7 +65,7 @@ def write_back(stream: NDArray[np.uint64], generator: np.random.Generator) -> No
     }
 
 
-@njit(cache=True)
+@inner
 def next_64(streams, b):  # type: ignore[no-untyped-def]
     """The next 64 random bits."""
     high, low = streams[b, 0], streams[b, 1]
@@ -86,7 +87,7 @@ def next_64(streams, b):  # type: ignore[no-untyped-def]
     return (value >> turn) | (value << ((_64 - turn) & _63))
 
 
-@njit(cache=True)
+@inner
 def next_32(streams, b):  # type: ignore[no-untyped-def]
     """The next 32 random bits, as a uint64; every second call takes the kept half of a 64-bit draw."""
     if streams[b, 4] != _ZERO:
@@ -98,7 +99,7 @@ def next_32(streams, b):  # type: ignore[no-untyped-def]
     return value & _LOW_32
 
 
-@njit(cache=True)
+@inner
 def draw_interval(streams, b, largest):  # type: ignore[no-untyped-def]
     """Uniform on 0..largest by masked rejection: what `Generator.shuffle` draws."""
     if largest == 0:
@@ -112,7 +113,7 @@ def draw_interval(streams, b, largest):  # type: ignore[no-untyped-def]
             return value
 
 
-@njit(cache=True)
+@inner
 def draw_below(streams, b, bound):  # type: ignore[no-untyped-def]
     """Uniform on 0..bound-1 by Lemire's method: what `Generator.integers` and `choice` draw."""
     if bound <= 1:
@@ -128,7 +129,7 @@ def draw_below(streams, b, bound):  # type: ignore[no-untyped-def]
     return np.int64(product >> _32)
 
 
-@njit(cache=True)
+@inner
 def shuffle(streams, b, values, count):  # type: ignore[no-untyped-def]
     """Shuffle `values[:count]` in place, as `Generator.shuffle` shuffles a list."""
     for i in range(count - 1, 0, -1):

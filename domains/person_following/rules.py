@@ -13,9 +13,8 @@ slices would be counted references, which cost more than the rules themselves.
 
 from __future__ import annotations
 
-from numba import njit
-
 from domains.core import EMPTY, FORWARD, GOAL, LEFT, RIGHT, STAY, WALL
+from domains.person_following.compiled import entry, inner
 from domains.person_following.map_generation import generate_crossing
 from domains.person_following.paths import HEADING_ALWAYS, HEADING_NEVER, astar, step_x, step_y
 from domains.person_following.random_numbers import draw_below
@@ -60,7 +59,7 @@ SUCCESS, AGENT_AT_GOAL, LOST_PERSON, UNESCORTED, TIMEOUT = 1, 2, 3, 4, 5
 NO_ACTION = -1
 
 
-@njit(cache=True)
+@inner
 def _move_robots(rules, time_rests, grid, robot, person, actions, out):  # type: ignore[no-untyped-def]
     """The robots' part of a step; `out.acted` gets what they did, `out.entered` who entered the goal."""
     acted, entered = out.acted, out.entered
@@ -86,14 +85,14 @@ def _move_robots(rules, time_rests, grid, robot, person, actions, out):  # type:
                 entered[b] = grid[b, x, y] == GOAL
 
 
-@njit(cache=True)
+@inner
 def _look(see_through, grid, whose, views):  # type: ignore[no-untyped-def]
     """Fill `views` with what `whose` (the array of robots or of persons) see."""
     for b in range(views.shape[0]):
         look(grid, b, whose[b, X], whose[b, Y], whose[b, HEADING], see_through, views, b)
 
 
-@njit(cache=True)
+@inner
 def _configure_one(see_through, robot, person, views, b):  # type: ignore[no-untyped-def]
     side, ahead, heading = relative(
         robot[b, X], robot[b, Y], robot[b, HEADING], person[b, X], person[b, Y], person[b, HEADING]
@@ -101,14 +100,14 @@ def _configure_one(see_through, robot, person, views, b):  # type: ignore[no-unt
     return configuration_of(views, b, side, ahead, heading, see_through)
 
 
-@njit(cache=True)
+@inner
 def _configure(see_through, robot, person, views, configurations):  # type: ignore[no-untyped-def]
     """Fill `configurations` with where the robots, seeing `views`, see the persons."""
     for b in range(views.shape[0]):
         configurations[b] = _configure_one(see_through, robot, person, views, b)
 
 
-@njit(cache=True)
+@inner
 def _gap(store, grid, robot, person, b):  # type: ignore[no-untyped-def]
     found = distance(
         store,
@@ -125,7 +124,7 @@ def _gap(store, grid, robot, person, b):  # type: ignore[no-untyped-def]
     return max(found, 0)
 
 
-@njit(cache=True)
+@inner
 def _measure(store, grid, robot, person, gaps):  # type: ignore[no-untyped-def]
     """Fill `gaps` with the robots' distances to the persons; 0 where no path exists."""
     row_of, table, visits = store.row_of, store.distance, store.visits
@@ -137,16 +136,14 @@ def _measure(store, grid, robot, person, gaps):  # type: ignore[no-untyped-def]
         if slot >= 0 and visits[slot] >= 2:
             heading = person[b, HEADING]
             compare = rule == HEADING_ALWAYS or (rule != HEADING_NEVER and heading != 0)
-            row = row_of[
-                slot, (person[b, X] * size + person[b, Y]) * 4 + (heading if compare else 0)
-            ]
+            row = row_of[slot, (person[b, X] * size + person[b, Y]) * 4 + (heading if compare else 0)]
         if row >= 0:
             gaps[b] = max(table[row, (robot[b, X] * size + robot[b, Y]) * 4 + robot[b, HEADING]], 0)
         else:
             gaps[b] = _gap(store, grid, robot, person, b)
 
 
-@njit(cache=True)
+@inner
 def _plan(world, store, b):  # type: ignore[no-untyped-def]
     """Make person b a new plan from where it stands to its goal; at the goal, to turn about twice."""
     person, plan = world.person, world.plan
@@ -165,7 +162,7 @@ def _plan(world, store, b):  # type: ignore[no-untyped-def]
     person[b, PLAN_AT], person[b, PLAN_LENGTH] = 0, length
 
 
-@njit(cache=True)
+@inner
 def _move_persons(rules, world, store, configurations, gaps):  # type: ignore[no-untyped-def]
     """The persons' part of a step; what they do is kept as LAST_ACTION."""
     robot, person, plan = world.robot, world.person, world.plan
@@ -194,7 +191,7 @@ def _move_persons(rules, world, store, configurations, gaps):  # type: ignore[no
             person[b, Y] += step_y(heading)
 
 
-@njit(cache=True)
+@inner
 def _judge(rules, robot, person, out):  # type: ignore[no-untyped-def]
     """Rewards and ends of a step of person following, from what holds after both have moved."""
     acted, entered, gaps, configurations = out.acted, out.entered, out.distance, out.final_configuration
@@ -250,7 +247,7 @@ def _judge(rules, robot, person, out):  # type: ignore[no-untyped-def]
         visible[b] = seen
 
 
-@njit(cache=True)
+@inner
 def _judge_crossing(rules, robot, out):  # type: ignore[no-untyped-def]
     """Rewards and ends of a step of the crossing task: Minigrid's reward at the goal, nothing before."""
     max_steps = rules[R_MAX_STEPS]
@@ -263,7 +260,7 @@ def _judge_crossing(rules, robot, out):  # type: ignore[no-untyped-def]
         out.distance[b], out.visible[b], out.final_configuration[b] = 0, False, 0
 
 
-@njit(cache=True)
+@inner
 def _choose_map(rules, world, maps, b):  # type: ignore[no-untyped-def]
     """Put the map of environment b's next episode into its grid."""
     grid = world.grid
@@ -281,7 +278,7 @@ def _choose_map(rules, world, maps, b):  # type: ignore[no-untyped-def]
     world.robot[b, EPISODE] += 1
 
 
-@njit(cache=True)
+@inner
 def _begin(rules, world, store, b):  # type: ignore[no-untyped-def]
     """Start an episode of environment b on the map that lies in its grid."""
     grid, robot, person, plan = world.grid, world.robot, world.person, world.plan
@@ -315,7 +312,7 @@ def _begin(rules, world, store, b):  # type: ignore[no-untyped-def]
         _plan(world, store, b)
 
 
-@njit(cache=True)
+@entry
 def begin_batch(rules, world, store, maps, chosen, given, out):  # type: ignore[no-untyped-def]
     """Begin episodes where `chosen` [B]; on the map already in the grid if `given`, else on a new one."""
     grid, robot, person = world.grid, world.robot, world.person
@@ -333,15 +330,15 @@ def begin_batch(rules, world, store, maps, chosen, given, out):  # type: ignore[
             configurations[b] = _configure_one(see_through, robot, person, views, b)
 
 
-@njit(cache=True)
+@entry
 def measure_batch(world, store, gaps):  # type: ignore[no-untyped-def]
     """Distances [B] from the robots to the persons in the present states."""
     _measure(store, world.grid, world.robot, world.person, gaps)
 
 
-@njit(cache=True)
-def step_batch(rules, world, store, maps, actions, autoreset, out):  # type: ignore[no-untyped-def]
-    """Take one action per environment; with `autoreset`, begin a new episode at once where one ended."""
+@entry
+def step_batch(rules, world, store, actions, out):  # type: ignore[no-untyped-def]
+    """Take one action per environment; returns how many episodes ended, marked in `out.ended`."""
     grid, robot, person = world.grid, world.robot, world.person
     see_through = rules[R_SEE_THROUGH] != 0
     views, configurations = out.final_view, out.final_configuration
@@ -358,20 +355,15 @@ def step_batch(rules, world, store, maps, actions, autoreset, out):  # type: ign
         describe_batch(rules, world, out.final_person_view, out.final_pose, out.final_counters)
     else:
         _judge_crossing(rules, robot, out)
-    ended = out.ended
+    count = 0
     for b in range(actions.shape[0]):
         out.person_action[b] = person[b, LAST_ACTION]
-        ended[b] = autoreset and (out.terminated[b] or out.truncated[b])
-        if not ended[b]:
-            out.configuration[b] = configurations[b]
-            for x in range(views.shape[1]):
-                for y in range(views.shape[2]):
-                    out.robot_view[b, x, y] = views[b, x, y]
-    if autoreset:
-        begin_batch(rules, world, store, maps, ended, False, out)
+        out.ended[b] = out.terminated[b] or out.truncated[b]
+        count += out.ended[b]
+    return count
 
 
-@njit(cache=True)
+@entry
 def describe_batch(rules, world, views, poses, counters):  # type: ignore[no-untyped-def]
     """Fill the persons' views [B, v, v] and poses [B, 3] relative to the robots, and the counters [B, 2]."""
     robot, person = world.robot, world.person
@@ -384,7 +376,7 @@ def describe_batch(rules, world, views, poses, counters):  # type: ignore[no-unt
         counters[b, 0], counters[b, 1] = person[b, WAITING], robot[b, LOST]
 
 
-@njit(cache=True)
+@entry
 def expert_batch(world, store, follower, actions):  # type: ignore[no-untyped-def]
     """First actions [B] of the A* paths to the person (`follower`) or to the goal, on the full map."""
     grid, robot, person = world.grid, world.robot, world.person

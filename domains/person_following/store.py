@@ -12,10 +12,10 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from domains.core import STAY
+from domains.person_following.compiled import entry, inner
 from domains.person_following.paths import (
     HEADING_ALWAYS,
     HEADING_NEVER,
@@ -79,7 +79,7 @@ def shared_store(size: int, heading_rule: int) -> Store:
     )
 
 
-@njit(cache=True)
+@entry
 def map_hash(grids, b):  # type: ignore[no-untyped-def]
     """A stable hash of a grid: 64-bit FNV-1a over its bytes in C order, without the sign bit."""
     value = np.uint64(0xCBF29CE484222325)
@@ -90,7 +90,7 @@ def map_hash(grids, b):  # type: ignore[no-untyped-def]
     return np.int64(value & np.uint64(0x7FFFFFFFFFFFFFFF))
 
 
-@njit(cache=True)
+@inner
 def enter_map(store, grids, b, grid_hash, x, y, heading, goal_x, goal_y):  # type: ignore[no-untyped-def]
     """Slot of a map with a person's start and goal, its plan computed; -1 where the store is full."""
     size = grids.shape[1]
@@ -140,13 +140,13 @@ def enter_map(store, grids, b, grid_hash, x, y, heading, goal_x, goal_y):  # typ
     return slot
 
 
-@njit(cache=True)
+@inner
 def _compared(store, heading):  # type: ignore[no-untyped-def]
     rule = store.heading_rule[0]
     return rule == HEADING_ALWAYS or (rule != HEADING_NEVER and heading != 0)
 
 
-@njit(cache=True)
+@inner
 def _row(store, grids, b, slot, x, y, heading):  # type: ignore[no-untyped-def]
     """Row of the tables for a target pose on a map met before, filled if need be; -1 where there is none."""
     if slot < 0 or store.visits[slot] < 2:
@@ -165,7 +165,7 @@ def _row(store, grids, b, slot, x, y, heading):  # type: ignore[no-untyped-def]
     return row
 
 
-@njit(cache=True)
+@inner
 def distance(store, grids, b, slot, x, y, heading, to_x, to_y, to_heading):  # type: ignore[no-untyped-def]
     """Number of actions of a shortest path from a pose to another, by the store's heading rule; or NO_PATH."""
     pose = (x * grids.shape[1] + y) * 4 + heading
@@ -173,10 +173,12 @@ def distance(store, grids, b, slot, x, y, heading, to_x, to_y, to_heading):  # t
     if row >= 0:
         return np.int64(store.distance[row, pose])
     compare = _compared(store, to_heading)
-    return np.int64(distance_field(grids, b, to_x, to_y, to_heading, compare, pose, store.distance[0, :0], store.scratch))
+    return np.int64(
+        distance_field(grids, b, to_x, to_y, to_heading, compare, pose, store.distance[0, :0], store.scratch)
+    )
 
 
-@njit(cache=True)
+@inner
 def first_action(store, grids, b, slot, x, y, heading, to_x, to_y, to_heading):  # type: ignore[no-untyped-def]
     """First action of the A* path from a pose to a person's pose; STAY where there or where none exists."""
     pose = (x * grids.shape[1] + y) * 4 + heading
@@ -192,7 +194,7 @@ def first_action(store, grids, b, slot, x, y, heading, to_x, to_y, to_heading): 
     return action
 
 
-@njit(cache=True)
+@inner
 def first_action_to_goal(store, grids, b, slot, x, y, heading, goal_x, goal_y):  # type: ignore[no-untyped-def]
     """First action of the A* path from a pose to the goal cell; STAY where there or where none exists."""
     pose = (x * grids.shape[1] + y) * 4 + heading

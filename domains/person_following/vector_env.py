@@ -63,6 +63,7 @@ class PersonFollowingVectorEnv(VectorEnv):
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         """Begin new episodes everywhere; `options` as for the single environment, for all alike."""
+        begin = self.batch.checked_options(options)
         if seed is None:
             seed, self.pending_seed = self.pending_seed, None
         if seed is None and not self.batch.seeded:
@@ -73,7 +74,7 @@ class PersonFollowingVectorEnv(VectorEnv):
                 raise DomainError(f"{self.num_envs} seeds are needed, got {len(seeds)}")
             super().reset(seed=int(seeds[0]))
             self.batch.seed([int(one) for one in seeds])
-        self.batch.begin(options)
+        begin()
         self._begun = True
         last = self.batch.last
         observation: dict[str, NDArray[Any]] = {

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from numba import njit
-
 from domains.core import EMPTY, UNSEEN, WALL
+from domains.person_following.compiled import inner
 from domains.person_following.paths import step_x, step_y
 
 
-@njit(cache=True)
+@inner
 def look(grids, b, x, y, heading, see_through_walls, views, i):  # type: ignore[no-untyped-def]
     """Fill `views[i]` (uint8 [v, v]) with the cell kinds that a pose sees in `grids[b]`; agents are not shown.
 
@@ -37,7 +36,7 @@ def look(grids, b, x, y, heading, see_through_walls, views, i):  # type: ignore[
     views[i, half, width - 1] = EMPTY
 
 
-@njit(cache=True)
+@inner
 def _hide(view):  # type: ignore[no-untyped-def]
     """Mark cells of a full view as UNSEEN by Minigrid's rule: light spreads row by row, away from the viewer.
 
@@ -66,7 +65,7 @@ def _hide(view):  # type: ignore[no-untyped-def]
                 view[vx, vy] = UNSEEN
 
 
-@njit(cache=True)
+@inner
 def relative(x, y, heading, other_x, other_y, other_heading):  # type: ignore[no-untyped-def]
     """(side, ahead, heading) of another pose: side to the right, heading 3 where both look the same way."""
     fx, fy = step_x(heading), step_y(heading)
@@ -74,7 +73,7 @@ def relative(x, y, heading, other_x, other_y, other_heading):  # type: ignore[no
     return -dx * fy + dy * fx, dx * fx + dy * fy, (other_heading - heading - 1) & 3
 
 
-@njit(cache=True)
+@inner
 def configuration_of(views, i, side, ahead, heading, see_through_walls):  # type: ignore[no-untyped-def]
     """Configuration, in `views[i]`, of an agent at a relative pose: 0 where out of view, hidden or on top."""
     width = views.shape[1]

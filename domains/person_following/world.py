@@ -42,7 +42,7 @@ class Results(NamedTuple):
     person_action: NDArray[np.int8]  # [B]
     acted: NDArray[np.int64]  # [B]: what the robot did, resting included
     entered: NDArray[np.bool_]  # [B]: whether it entered the goal
-    ended: NDArray[np.bool_]  # [B]: whether a new episode began
+    ended: NDArray[np.bool_]  # [B]: whether the episode ended
     final_view: NDArray[np.uint8]  # [B, v, v]
     final_configuration: NDArray[np.int64]  # [B]
     final_person_view: NDArray[np.uint8]  # [B, v, v]
