@@ -12,9 +12,9 @@ from __future__ import annotations
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numba import njit
 
 from domains.core import UNSEEN, WALL, ViewGeometry
+from nesy.compiled import njit
 from nesy.errors import UserError
 from nesy.world_model.rolling import Rollout
 from nesy.world_model.successors import Factored, PackedModel, pack

@@ -12,8 +12,8 @@ starts afresh from the observation: a defined fallback, counted in `resets`.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from nesy.compiled import njit
 from planners import kernels
 from planners.ialm import IALM, SCALARS
 from planners.kernels import Model

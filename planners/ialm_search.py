@@ -12,8 +12,8 @@ import time
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from nesy.compiled import njit
 from planners import ialm, kernels
 from planners.config import SearchConfig
 from planners.ialm import IALM, SCALARS

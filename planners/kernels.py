@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from nesy.compiled import njit
 from nesy.dbn.kernels import Packed
 from planners import ialm
 from planners.ialm import IALM

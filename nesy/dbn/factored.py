@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from nesy.compiled import njit
 from nesy.dbn.inference import ancestors
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError

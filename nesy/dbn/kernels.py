@@ -8,8 +8,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from nesy.compiled import njit
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
 

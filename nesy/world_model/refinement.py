@@ -12,8 +12,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from nesy.compiled import njit
 from nesy.world_model.distinct import Transitions
 from nesy.world_model.structure import Limits, Structure, search
 

@@ -10,7 +10,8 @@ from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
-from numba import njit
+
+from nesy.compiled import njit
 
 CAPACITY = 4096
 
