@@ -128,9 +128,9 @@ def _simulate(
             for i in range(state.shape[0]):
                 state[i] = after[i]
             value = leaf_values[state[2 * n], state[2 * n + 1], state[2 * n + 2], min(state[2 * n + 4], last_lost)]
-            observation = np.int64(variables[3 * n + ialm.MOTION])
+            observation = int(variables[3 * n + ialm.MOTION])
             if visible != 0:
-                pose = (np.int64(state[2 * n]) * 512 + state[2 * n + 1]) * 4 + state[2 * n + 2]
+                pose = (int(state[2 * n]) * 512 + state[2 * n + 1]) * 4 + state[2 * n + 2]
                 observation += 4 * (pose + 1)
             node = find_child(tree, node, action, observation, True)
             if node < 0:

@@ -1,9 +1,11 @@
 """Conditional tables with chosen parents: P(target | parents) or E[target | parents] as a decision tree.
 
 A tree asks one question about one parent per node ("factor 3 is 5", "ahead <= 2"), so a table over a dozen
-parents needs only as many rows as there are contexts that make a difference. Rows keep their counts. Growth
-is greedy and stops where the gain in log-likelihood no longer pays for saying which question is asked and for
-the parameters that it adds (a two-part code, which is BIC within the node); no other stopping rule is needed.
+parents needs only as many rows as there are contexts that make a difference. Rows keep their counts. A tree is
+grown as long as a question gains anything, and then pruned from below wherever the gain in log-likelihood is
+less than `_PRICE` per question: noise is cut off, while a rare context that behaves differently, every time, is
+kept. (The usual BIC gives up such contexts, and a planner finds the mistake.) Pruning rather than stopping early
+finds contexts that only several questions together tell apart.
 
 Every table is learned from (parents, target) pairs and knows nothing about what they mean.
 """
@@ -14,9 +16,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from nesy.compiled import njit
 
 _VARIANCE_FLOOR = 1e-4
+_PRICE = 2.0  # nats
 
 
 @dataclass(frozen=True)
@@ -171,17 +175,14 @@ def _learn(variables: np.ndarray, parents: Parents, moments: np.ndarray, kind: s
         raise ValueError("the parents of a table must be non-negative integers")
     columns, moments = _collapsed(columns, moments)
     sizes = columns.max(axis=1).astype(np.int64) + 1
-    questions = sum(
-        int(size) * (2 if is_ordered else 1) for size, is_ordered in zip(sizes, parents.ordered, strict=True)
-    )
     slot, value, ordered, yes, no, node_moments = _grow(
         columns,
         np.array(parents.ordered, dtype=np.bool_),
         sizes,
         moments,
         kind == "mean",
-        float(np.log(questions)),
     )
+    slot, value, ordered, yes, no, node_moments = _pruned(slot, value, ordered, yes, no, node_moments, kind == "mean")
     slots = np.array(parents.slots, dtype=np.int32)
     slot = np.where(slot >= 0, slots[np.maximum(slot, 0)], -1).astype(np.int32)
     names = dict(zip(parents.slots, parents.names, strict=True))
@@ -231,23 +232,15 @@ def _best_split(
     sizes: np.ndarray,
     moments: np.ndarray,
     mean: bool,
-    log_questions: float,
     rows: np.ndarray,
     here: np.ndarray,
     node: int,
 ) -> tuple[int, int, bool]:
-    """Feature, value and kind of the question that gains most at `node`; feature -1 if none pays for itself."""
+    """Feature, value and kind of the question that gains most at `node`; feature -1 if none gains anything."""
     width = moments.shape[1]
-    total, classes = 0.0, 0.0
-    for k in range(width):
-        total += here[node, k]
-        classes += 1.0 if here[node, k] > 0.0 else 0.0
-    if mean:
-        total, classes = here[node, 0], 3.0
-    penalty = log_questions + 0.5 * (classes - 1.0) * np.log(max(total, 2.0))
     zero = np.zeros((1, width))
     base = _score(here, node, zero, 0, mean)
-    best_gain, best_feature, best_value, best_ordered = penalty, -1, 0, False
+    best_gain, best_feature, best_value, best_ordered = 1e-6, -1, 0, False
     histogram = np.zeros((sizes.max(), width))
     below = np.zeros((1, width))
     for feature in range(columns.shape[0]):
@@ -275,7 +268,7 @@ def _best_split(
 
 @njit(cache=True)
 def _grow(
-    columns: np.ndarray, ordered: np.ndarray, sizes: np.ndarray, moments: np.ndarray, mean: bool, log_questions: float
+    columns: np.ndarray, ordered: np.ndarray, sizes: np.ndarray, moments: np.ndarray, mean: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     n = columns.shape[1]
     width = moments.shape[1]
@@ -298,7 +291,7 @@ def _grow(
     node = 0
     while node < nodes:  # breadth first: a parent always comes before its children
         feature, split, less = _best_split(
-            columns, ordered, sizes, moments, mean, log_questions, index[begin[node] : end[node]], here, node
+            columns, ordered, sizes, moments, mean, index[begin[node] : end[node]], here, node
         )
         if feature >= 0:
             front, back = begin[node], 0
@@ -324,6 +317,45 @@ def _grow(
             nodes += 2
         node += 1
     return slot[:nodes], value[:nodes], is_ordered[:nodes], yes[:nodes], no[:nodes], here[:nodes]
+
+
+def _pruned(
+    slot: np.ndarray,
+    value: np.ndarray,
+    ordered: np.ndarray,
+    yes: np.ndarray,
+    no: np.ndarray,
+    moments: np.ndarray,
+    mean: bool,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Keep a split only where its subtree as a whole pays for itself; renumber what is left, breadth first."""
+    zero = np.zeros((1, moments.shape[1]))
+    worth = np.array([_score(moments, node, zero, 0, mean) for node in range(len(slot))])
+    kept = slot >= 0
+    for node in range(len(slot) - 1, -1, -1):  # children come after their parent
+        if kept[node]:
+            below = worth[yes[node]] + worth[no[node]] - _PRICE
+            kept[node] = below > worth[node]
+            worth[node] = max(below, worth[node])
+    order = [0]
+    new_yes, new_no = [], []
+    for node in order:  # grows while it is walked through
+        if kept[node]:
+            new_yes.append(len(order))
+            new_no.append(len(order) + 1)
+            order += [int(yes[node]), int(no[node])]
+        else:
+            new_yes.append(0)
+            new_no.append(0)
+    chosen = np.array(order)
+    return (
+        np.where(kept[chosen], slot[chosen], -1),
+        value[chosen],
+        ordered[chosen],
+        np.array(new_yes, np.int32),
+        np.array(new_no, np.int32),
+        moments[chosen],
+    )
 
 
 @njit(cache=True)
