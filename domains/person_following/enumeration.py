@@ -111,7 +111,7 @@ def all_transitions(
     return places, views[0], actions, views[1]
 
 
-@inner
+@entry
 def _collect_transitions(grids, see_through_walls, places, before, actions, after):  # type: ignore[no-untyped-def]
     count = 0
     for m in range(grids.shape[0]):
