@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from domains.core import EMPTY, GOAL, WALL, DomainError
-from domains.person_following.compiled import entry, inner
+from domains.person_following.compiled import entry
 from domains.person_following.paths import step_x, step_y
 from domains.person_following.variants import Parameters
 from domains.person_following.views import look

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from domains.core import Domain, DomainError
 from nesy.experience import Experience
 
 
@@ -76,36 +77,54 @@ def unobstructed(experience: Experience) -> np.ndarray:
     return ~ahead
 
 
-def transitions_of(experience: Experience, *, base: Transitions | None = None) -> Transitions:
+def transitions_of(
+    experience: Experience, *, base: Transitions | None = None, views: np.ndarray | None = None
+) -> Transitions:
     """The distinct views of `experience`, and its distinct unobstructed transitions.
 
     Args:
         experience: any rows.
         base: index views as this set does; it must hold every view of `experience`.
+        views: uint8 [m, v, v], further views to index although nothing was met there.
     """
-    keys = view_keys(np.concatenate([experience.view, experience.next_view]))
+    further = experience.view[:0] if views is None else views
+    keys = view_keys(np.concatenate([experience.view, experience.next_view, further]))
     count = len(experience)
     if base is None:
-        unique, first, index, visits = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
-        views = np.where(
-            (first < count)[:, None, None],
-            experience.view[np.minimum(first, count - 1)],
-            experience.next_view[np.maximum(first - count, 0)],
-        )
+        unique, first, index = np.unique(keys, return_index=True, return_inverse=True)
+        distinct = np.concatenate([experience.view, experience.next_view, further])[first]
     else:
-        unique = view_keys(base.views)
+        unique, distinct = view_keys(base.views), base.views
         index = np.searchsorted(unique, keys)
         assert (unique[np.minimum(index, len(unique) - 1)] == keys).all(), "a view outside the base set"
-        views, visits = base.views, np.bincount(index, minlength=len(unique))
+    visits = np.bincount(index[: 2 * count], minlength=len(unique))
     free = unobstructed(experience)
-    source, target = index[:count][free], index[count:][free]
-    action = experience.action[free].astype(np.int64)
-    _, place = np.unique(experience.map_id[free], return_inverse=True)
-    total = len(views)
-    edge = (source * 4 + action) * total + target
+    edge = (index[:count] * 4 + experience.action) * len(unique) + index[count : 2 * count]
+    _, place = np.unique(experience.map_id, return_inverse=True)
     # One entry per (map, transition), then one per transition with the number of maps as its weight.
-    per_map = np.unique(np.stack([edge, place]), axis=1)[0] if len(edge) else edge
-    edges, weight = np.unique(per_map, return_counts=True)
+    per_map = np.unique(edge[free] * (int(place.max(initial=0)) + 1) + place[free])
+    edges, weight = np.unique(per_map // (int(place.max(initial=0)) + 1), return_counts=True)
+    return _from_edges(distinct, visits, edges, weight)
+
+
+def reference_transitions(domain: Domain, variant: str, task: str = "following") -> Transitions | None:
+    """Every step from every pose of every map, each counted once: the set that no behaviour has chosen.
+
+    Returns None where the maps of the variant are too many to list.
+    """
+    try:
+        _, before, action, after = domain.transitions(variant, task=task)
+    except DomainError:
+        return None
+    unique, first, index = np.unique(view_keys(np.concatenate([before, after])), return_index=True, return_inverse=True)
+    edge = (index[: len(before)] * 4 + action) * len(unique) + index[len(before) :]
+    edges, weight = np.unique(edge, return_counts=True)
+    distinct = np.concatenate([before, after])[first]
+    return _from_edges(distinct, np.bincount(index, minlength=len(unique)), edges, weight)
+
+
+def _from_edges(views: np.ndarray, visits: np.ndarray, edges: np.ndarray, weight: np.ndarray) -> Transitions:
+    total = len(views)
     return Transitions(
         views=np.ascontiguousarray(views),
         visits=visits.astype(np.int64),

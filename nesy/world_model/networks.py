@@ -205,8 +205,9 @@ class SymbolicWorldModel(WorldModel):
     def transition(self, belief: Tensor, action: Tensor) -> Tensor:
         """Next marginals [B, N, K] in float32.
 
-        Exact for a belief that is certain of a code when no factor has more than one parent in slice t+1;
-        otherwise parents are taken as independent given the belief.
+        Exact for a belief that is certain of a code, when two parents in slice t+1 are always parent and child
+        themselves (as the search sees to): then the joint of every pair that is needed is at hand. Otherwise
+        parents are taken as independent given the belief.
         """
         structure = self.structure()
         if not self._torch_tables or self._torch_tables[0][0].device != belief.device:
@@ -219,22 +220,39 @@ class SymbolicWorldModel(WorldModel):
             for rows in torch.nonzero(action == a).flatten().split(CHUNK):
                 if not len(rows):
                     continue
-                before = belief[rows]
-                after: dict[int, Tensor] = {}
-                for i in structure.order:
-                    parents = [before[:, j] for j in structure.parents_now[a][i]]
-                    parents += [after[j] for j in structure.parents_next[a][i]]
-                    after[i] = _mix(self._torch_tables[a][i], parents, len(rows))
-                result[rows] = torch.stack([after[i] for i in range(self.num_factors)], 1)
+                result[rows] = self._next_marginals(belief[rows], a, structure)
         return result
+
+    def _next_marginals(self, belief: Tensor, a: int, structure: Structure) -> Tensor:
+        size, num_values = len(belief), self.num_values
+        single: dict[int, Tensor] = {}
+        pairs: dict[tuple[int, int], Tensor] = {}
+        for i in structure.order:
+            now = [belief[:, j] for j in structure.parents_now[a][i]]
+            given = structure.parents_next[a][i]
+            # P(x'_i | parents in slice t+1), the parents in slice t averaged out: [B, K, ..., K]
+            joint = _mix(self._torch_tables[a][i], now, size).view(size, *[num_values] * (len(given) + 1))
+            if len(given) == 2 and given in pairs:
+                joint = joint * pairs[given].unsqueeze(-1)
+            else:
+                for position, j in enumerate(given):
+                    shape = [size, *[1] * position, num_values, *[1] * (len(given) - position)]
+                    joint = joint * single[j].view(shape)
+            axes = list(range(1, len(given) + 1))
+            single[i] = joint.sum(axes) if axes else joint
+            for j in given:
+                others = [position + 1 for position, k in enumerate(given) if k != j]
+                pairs[j, i] = joint.sum(others) if others else joint
+                pairs[i, j] = pairs[j, i].transpose(1, 2)
+        return torch.stack([single[i] for i in range(self.num_factors)], 1)
 
 
 def _mix(table: Tensor, parents: list[Tensor], size: int) -> Tensor:
-    """Average of a table's rows [rows, K] under independent parents, each [B, K]: [B, K], with B = `size`."""
-    num_values = table.shape[1]
+    """Average of a table over its first digits, under independent parents [B, K] for them: [B, rest of a row]."""
     if not parents:
-        return table.expand(size, num_values)
+        return table.reshape(1, -1).expand(size, -1)
     # The most significant parent first: one matrix product, then the remaining digits by batched products.
+    num_values = table.shape[1]
     mixed = parents[0] @ table.view(num_values, -1)
     for parent in parents[1:]:
         mixed = torch.bmm(parent[:, None], mixed.view(size, num_values, -1)).view(size, -1)

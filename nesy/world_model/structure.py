@@ -10,7 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
+
+from nesy.compiled import njit
 
 
 @dataclass(frozen=True)
@@ -19,8 +20,9 @@ class Limits:
 
     now: int = 4
     """Most parents from slice t per factor and action."""
-    next: int = 1
-    """Most parents from slice t+1; with one at most, the arcs inside a slice form a forest."""
+    next: int = 2
+    """Most parents from slice t+1, at most 2. Two are allowed only if one is a parent of the other, so that the
+    arcs inside a slice form a 2-tree and next marginals can be computed exactly, pair by pair."""
     total: int = 5
     """Most parents in all: a table has `values ** total` rows."""
     penalty: float = 0.0
@@ -120,22 +122,25 @@ def search(
     assert now.shape == then.shape and len(now) == len(action) == len(weight) > 0
     num_factors = now.shape[1]
     order = order or tuple(range(num_factors))
-    parents_now = [[() for _ in range(num_factors)] for _ in range(num_actions)]
-    parents_next = [[() for _ in range(num_factors)] for _ in range(num_actions)]
+    parents_now: list[list[tuple[int, ...]]] = [[()] * num_factors for _ in range(num_actions)]
+    parents_next: list[list[tuple[int, ...]]] = [[()] * num_factors for _ in range(num_actions)]
     total = 0.0
     for a in range(num_actions):
         rows = action == a
         columns = (now[rows].astype(np.int64).T.copy(), then[rows].astype(np.int64).T.copy())
         mass = weight[rows].astype(np.float64)
         for position, i in enumerate(order):
-            family, entropy, score = _best_family(columns, mass, i, order[:position], num_values, limits)
-            if start is not None:
+            adjacent = {frozenset((j, k)) for j in order[:position] for k in parents_next[a][j]}
+            family, entropy, score = _best_family(columns, mass, i, order[:position], adjacent, num_values, limits)
+            if start is not None and (
+                len(start.parents_next[a][i]) < 2 or frozenset(start.parents_next[a][i]) in adjacent
+            ):
                 kept = [(0, j) for j in start.parents_now[a][i]] + [(1, j) for j in start.parents_next[a][i]]
                 kept_entropy, cells = _entropy_of(columns, mass, i, kept, num_values)
                 if kept_entropy + limits.penalty * cells <= score:
                     family, entropy = kept, kept_entropy
-            parents_now[a][i] = tuple(j for kind, j in family if kind == 0)  # type: ignore[assignment]
-            parents_next[a][i] = tuple(j for kind, j in family if kind == 1)  # type: ignore[assignment]
+            parents_now[a][i] = tuple(j for kind, j in family if kind == 0)
+            parents_next[a][i] = tuple(j for kind, j in family if kind == 1)
             total += entropy
     structure = Structure(tuple(map(tuple, parents_now)), tuple(map(tuple, parents_next)), tuple(order))
     return structure, total / float(weight.sum())
@@ -159,6 +164,7 @@ def _best_family(
     mass: np.ndarray,
     factor: int,
     earlier: tuple[int, ...],
+    adjacent: set[frozenset[int]],
     num_values: int,
     limits: Limits,
 ) -> tuple[list[tuple[int, int]], float, float]:
@@ -166,9 +172,13 @@ def _best_family(
     entropy, cells = _entropy_of(columns, mass, factor, family, num_values)
     score = entropy + limits.penalty * cells
     while len(family) < limits.total:
-        used_next = sum(kind for kind, _ in family)
-        candidates = [(1, j) for j in earlier] if used_next < limits.next else []
-        if len(family) - used_next < limits.now:
+        used_next = [j for kind, j in family if kind == 1]
+        candidates = [
+            (1, j)
+            for j in earlier
+            if len(used_next) < limits.next and (not used_next or frozenset((j, used_next[0])) in adjacent)
+        ]
+        if len(family) - len(used_next) < limits.now:
             candidates += [(0, j) for j in range(len(columns[0]))]
         best: tuple[float, float, tuple[int, int]] | None = None
         for candidate in candidates:

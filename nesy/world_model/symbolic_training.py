@@ -34,12 +34,14 @@ REFINE_UP_TO = 5000
 """Most distinct views for which codes are refined one by one."""
 MOST_STEPS = 200
 """Mini-batches in one epoch at most."""
+MOST_PARENTS = 5
+"""Parents of a factor in both slices together: a table has `values ** MOST_PARENTS` rows at most."""
 LEARNING_SCALE = 0.3
 """Share of the configured step size that suits plain perceptrons."""
 USAGE_WEIGHT, FORWARD_WEIGHT, INVERSE_WEIGHT = 0.02, 0.1, 0.1
-RELUCTANCE = 0.1
+RELUCTANCE = 1.5
 """Nats of cost per nat of the encoder's disbelief."""
-NOISE = 3.0
+NOISE = 12.0
 """Annealing temperature of the refinement at its start, in nats."""
 SWEEPS = 2
 """Passes over the code book per round of refinement."""
@@ -96,8 +98,10 @@ class SymbolicTrainer:
         self.weights = losses.class_weights(training.views, np.maximum(training.visits, 0)).to(self.device)
         self.optimizer = self._optimizer(config.learning_rate * LEARNING_SCALE)
         self.rng = np.random.default_rng(seed)
-        next_arcs = 1 if config.intra_slice_arcs else 0
-        bounds = Limits(now=config.max_parents, next=next_arcs, total=min(config.max_parents + next_arcs, 6))
+        arcs = 2 if config.intra_slice_arcs else 0
+        bounds = Limits(
+            now=config.max_parents, next=arcs, total=min(config.max_parents + arcs, MOST_PARENTS), penalty=1.0
+        )
         self.refiner = Refiner(self.final, self.model.num_values, self.model.num_actions, bounds)
         self.train_refiner = Refiner(training, self.model.num_values, self.model.num_actions, bounds)
         self.rounds = max(4, round(config.epochs / 4)) if self.refines else 0
@@ -203,7 +207,7 @@ class SymbolicTrainer:
     # ---------------------------------------------------------------- stage 2
     def _codes_round(self) -> dict[str, Any]:
         assert self.book is not None and self.reluctance is not None
-        noise = NOISE * max(0.0, 1.0 - self.epoch / (0.7 * self.rounds))
+        noise = NOISE * max(0.0, 1.0 - self.epoch / (0.8 * self.rounds))
         self.book, moved = self.refiner.refine(self.book, self.reluctance, noise, SWEEPS, self.rng)
         return {"next_code_nll": self.book.nll, "moved": moved, "noise": noise}
 

@@ -1,12 +1,14 @@
 """Conditional tables of the forward model: counted under a structure, with back-off for rows never seen.
 
 A row of a table is one combination of parent values in mixed radix, first parent most significant. With
-counts c(r, k) of row r and the table p' of the same family without its last parent,
+counts c(r, k) of row r, the number t(r) of distinct values met in it (1 at least) and the table p' of the same
+family without one of its parents,
 
-    p(k | r) = (c(r, k) + strength * p'(k | r without last parent)) / (c(r) + strength)
+    p(k | r) = (c(r, k) + strength * t(r) * p'(k | r without that parent)) / (c(r) + strength * t(r))
 
-so a row never seen falls back to fewer parents, and at last to the (add-one) marginal: every row is a proper
-distribution with no zeros.
+which is Witten and Bell's smoothing with a strength. A row never seen falls back to fewer parents, and at last to
+the marginal: every row is a proper distribution with no zeros. The parents of slice t are left out first, the last
+one chosen before the others: the arcs inside slice t+1 keep even a guess consistent in itself.
 """
 
 from __future__ import annotations
@@ -15,8 +17,10 @@ import numpy as np
 
 from nesy.world_model.structure import Structure
 
-STRENGTH = 0.02
-"""Weight of the back-off distribution, in transitions."""
+STRENGTH = 0.03
+"""Weight of the back-off distribution of the full table, in transitions."""
+SHORTENED = 10.0
+"""How much stronger the tables of fewer parents are smoothed: they are asked only where the full one is silent."""
 
 
 def row_index(values: np.ndarray, num_values: int) -> np.ndarray:
@@ -28,28 +32,42 @@ def row_index(values: np.ndarray, num_values: int) -> np.ndarray:
 
 
 def conditional_table(
-    parents: np.ndarray, child: np.ndarray, weight: np.ndarray, num_values: int, strength: float = STRENGTH
+    parents: np.ndarray,
+    num_now: int,
+    child: np.ndarray,
+    weight: np.ndarray,
+    num_values: int,
+    strength: float = STRENGTH,
 ) -> np.ndarray:
     """A conditional table with back-off.
 
     Args:
-        parents: int [E, P] values of the parents.
+        parents: int [E, P] values of the parents, those of slice t first.
+        num_now: how many of them are of slice t.
         child: int [E] values of the child.
         weight: [E].
         num_values: K.
-        strength: weight of the back-off distribution.
+        strength: weight of the back-off distribution of the full table.
 
     Returns:
         float64 [K ** P, K]; rows sum to 1.
     """
+    width = parents.shape[1]
+    order = [*range(num_now, width), *range(num_now)]
+    values = parents[:, order]
     counts = np.bincount(child, weights=weight, minlength=num_values)
     table = ((counts + 1.0 / num_values) / (counts.sum() + 1.0))[None]
-    for depth in range(1, parents.shape[1] + 1):
-        cell = row_index(parents[:, :depth], num_values) * num_values + child
+    for depth in range(1, width + 1):
+        cell = row_index(values[:, :depth], num_values) * num_values + child
         counts = np.bincount(cell, weights=weight, minlength=num_values ** (depth + 1)).reshape(-1, num_values)
-        table = counts + strength * np.repeat(table, num_values, axis=0)
+        met = np.maximum((counts > 0).sum(axis=1, keepdims=True), 1)
+        weight_below = strength * met * (SHORTENED if depth < width else 1.0)
+        table = counts + weight_below * np.repeat(table, num_values, axis=0)
         table /= table.sum(axis=1, keepdims=True)
-    return table
+    # Back from the order of the back-off to the order of the parents.
+    axes = [order.index(parent) for parent in range(width)]
+    table = table.reshape((num_values,) * (width + 1)).transpose([*axes, width])
+    return np.ascontiguousarray(table).reshape(-1, num_values)
 
 
 def all_tables(
@@ -82,6 +100,7 @@ def all_tables(
                     np.concatenate(
                         [before[:, structure.parents_now[a][i]], after[:, structure.parents_next[a][i]]], axis=1
                     ),
+                    len(structure.parents_now[a][i]),
                     after[:, i],
                     mass,
                     num_values,

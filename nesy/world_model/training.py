@@ -41,6 +41,7 @@ def train(
     seed: int = 0,
     progress: Progress = SILENT,
     *,
+    views: np.ndarray | None = None,
     reference: Transitions | None = None,
 ) -> dict[str, Any]:
     """Train a world model, or go on where an interrupted training stopped.
@@ -51,6 +52,7 @@ def train(
         folder: where model, checkpoint and logs go.
         seed: of everything random.
         progress: where to report.
+        views: uint8 [m, v, v], views to encode and rebuild although no episode may show them.
         reference: transitions to compute the gates on; those of all the experience by default.
 
     Returns:
@@ -65,7 +67,7 @@ def train(
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # small networks: one thread is as fast, and sums are in the same order everywhere
     try:
-        return _train(experience, config, folder, seed, progress, reference)
+        return _train(experience, config, folder, seed, progress, views, reference)
     finally:
         torch.set_num_threads(threads)
 
@@ -76,9 +78,10 @@ def _train(
     folder: Path,
     seed: int,
     progress: Progress,
+    views: np.ndarray | None,
     reference: Transitions | None,
 ) -> dict[str, Any]:
-    everything = transitions_of(experience)
+    everything = transitions_of(experience, views=views)
     training, held_out = everything, None
     if config.held_out > 0:
         apart = experience.held_out_maps(config.held_out, np.random.default_rng(seed))
