@@ -203,7 +203,13 @@ def asp_rules(rules: RuleSet, head: str, atom: str) -> str:
     """
     lines = []
     for rule in rules.rules:
-        body = ", ".join(f"{atom}({f},({';'.join(map(str, values))}))" for f, values in rule.conditions)
+        # a set of values is a cardinality condition: a pool would multiply into one rule per combination
+        body = ", ".join(
+            f"{atom}({f},{values[0]})"
+            if len(values) == 1
+            else f"1 {{ {'; '.join(f'{atom}({f},{v})' for v in values)} }}"
+            for f, values in rule.conditions
+        )
         lines.append(f"{head} :- {body}." if body else f"{head}.")
     return "\n".join(lines)
 

@@ -14,14 +14,14 @@ from dataclasses import dataclass
 import clingo
 import numpy as np
 
-from nesy.asp.facts import LEAST, Facts, asp_name
+from nesy.asp.diagrams import diagram, diagram_facts
+from nesy.asp.facts import LEAST, asp_name
 from nesy.asp.semantics import RuleSet, asp_rules, predicate_rules
 from nesy.dbn.codebook import Codebook
 from nesy.dbn.inference import ancestors
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
 
-MAX_PARENTS = 6
 _LITERAL = re.compile(
     r"\s*(?:(?P<factor>\w+)\s*(?P<relation>!?=)\s*(?P<value>\d+)|(?P<not>not\s+)?(?P<name>[a-z]\w*))\s*$"
 )
@@ -109,7 +109,7 @@ def verify(
         least: values of a row less probable than this are taken as impossible.
 
     Raises:
-        UserError: a literal is wrong, or a table has too many parents.
+        UserError: a literal is wrong, or `least` leaves a row without any value.
     """
     if codes not in ("all", "met"):
         raise UserError(f"codes '{codes}': a property is checked over all codes or over those met")
@@ -129,15 +129,15 @@ def verify(
     lines += [f"factor({i})." for i in used] + [f"needed({i})." for i in needed]
     lines += [f"premise({literal.term})." for literal in before]
     lines += [f"conclusion({literal.term})." for literal in after]
-    for name, found in rules.items():
-        lines.append(asp_rules(found, f"means({asp_name(name)},0)", "at"))
-        lines.append(asp_rules(found, f"means({asp_name(name)},1)", "next"))
+    for name, found_rules in rules.items():
+        lines.append(asp_rules(found_rules, f"means({asp_name(name)},0)", "at"))
+        lines.append(asp_rules(found_rules, f"means({asp_name(name)},1)", "next"))
     known = codebook.distinct_codes()[0] if codes == "met" and codebook is not None else None
     dropped = 0.0
     for i in needed:
-        texts, lost = _rows(dbn, action, i, known, least)
-        lines += texts
-        dropped = max(dropped, lost)
+        found = diagram(dbn, action, i, least, None if known is None else _rows_of(dbn, action, i, known))
+        lines += diagram_facts(dbn, action, i, found)
+        dropped = max(dropped, found.dropped)
     if known is not None:
         lines += [f"code({c},{i},{code[i]})." for c, code in enumerate(known.tolist()) for i in used]
     found_codes = _solve("\n".join(lines), dbn.num_factors)
@@ -167,26 +167,6 @@ def _factors_that_matter(
     if any(literal.term == "same" for literal in after):
         used |= goal
     return sorted(needed), sorted(used)
-
-
-def _rows(
-    dbn: TwoSliceDBN, action: int, factor: int, known: np.ndarray | None, least: float
-) -> tuple[list[str], float]:
-    """Facts arity/2, parent/4 and may/3 of one table, and the largest mass that a row loses."""
-    parents = dbn.parents(action, factor)
-    if len(parents) > MAX_PARENTS:
-        raise UserError(f"{dbn.factor_names[factor]} has {len(parents)} parents; verification handles {MAX_PARENTS}")
-    lines = [f"arity({factor},{len(parents)})."]
-    lines += [f"parent({factor},{j},{p},{where})." for j, (where, p) in enumerate(parents, 1)]
-    table = dbn.cpt(action, factor)
-    rows = np.arange(len(table)) if known is None else _rows_of(dbn, action, factor, known)
-    chosen = table[rows]
-    index, values = np.nonzero(chosen >= least)
-    contexts = Facts(dbn, None).contexts(rows, len(parents))
-    head = f"may({factor},"
-    lines += [f"{head}{contexts[r]},{v})." for r, v in zip(index.tolist(), values.tolist(), strict=True)]
-    lost = float(np.where(chosen < least, chosen, 0.0).sum(axis=1).max(initial=0.0))
-    return lines, lost
 
 
 def _rows_of(dbn: TwoSliceDBN, action: int, factor: int, known: np.ndarray) -> np.ndarray:
