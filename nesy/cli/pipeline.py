@@ -217,9 +217,11 @@ class Pipeline:
         """Train the world model."""
         self.run.require("collect")
         if not self.run.has("train"):
+            from domains.core import load_domain
             from nesy.experience import Experience
             from nesy.world_model import train
 
+            domain = load_domain(self.config.domain)
             metrics = self._timed(
                 "train",
                 lambda: train(
@@ -228,6 +230,8 @@ class Pipeline:
                     self.run.world_model,
                     seed=self.config.seed,
                     progress=self.progress,
+                    domain=domain,
+                    variant=self.config.variant,
                 ),
             )
             self.run.update_summary(world_model=metrics)

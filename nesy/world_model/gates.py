@@ -116,9 +116,15 @@ def infer_actions(codec: SymbolicCodec, before: np.ndarray, after: np.ndarray) -
     return np.concatenate(inferred)
 
 
-def evaluate(codec: SymbolicCodec, transitions: Transitions) -> dict[str, Any]:
-    """All gates on `transitions`, with `limits` and `passed` (which gates hold)."""
-    figures = {**view_gates(codec, transitions.views), **next_gates(codec, transitions)}
+def evaluate(codec: SymbolicCodec, transitions: Transitions, views: np.ndarray | None = None) -> dict[str, Any]:
+    """All gates, with `limits` and `passed` (which gates hold).
+
+    Args:
+        codec: of the model.
+        transitions: for the forward and the inverse model.
+        views: uint8 [V, v, v] distinct, for the code; those of `transitions` by default.
+    """
+    figures = {**view_gates(codec, transitions.views if views is None else views), **next_gates(codec, transitions)}
     best = limits(transitions)
     passed = {
         "views_exact": figures["views_exact"] == 1.0,

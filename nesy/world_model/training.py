@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from domains.core import Domain
 from nesy.config import TrainConfig
 from nesy.errors import UserError
 from nesy.experience import Experience
 from nesy.progress import SILENT, Progress
 from nesy.world_model.codec import SymbolicCodec
-from nesy.world_model.distinct import Transitions, transitions_of
+from nesy.world_model.distinct import Transitions, reference_transitions, transitions_of
 from nesy.world_model.gates import evaluate
 from nesy.world_model.logs import MetricsLog
 from nesy.world_model.paper_training import PaperTrainer
@@ -41,8 +42,8 @@ def train(
     seed: int = 0,
     progress: Progress = SILENT,
     *,
-    views: np.ndarray | None = None,
-    reference: Transitions | None = None,
+    domain: Domain | None = None,
+    variant: str = "paper",
 ) -> dict[str, Any]:
     """Train a world model, or go on where an interrupted training stopped.
 
@@ -52,12 +53,15 @@ def train(
         folder: where model, checkpoint and logs go.
         seed: of everything random.
         progress: where to report.
-        views: uint8 [m, v, v], views to encode and rebuild although no episode may show them.
-        reference: transitions to compute the gates on; those of all the experience by default.
+        domain: where the experience is from. If its maps can be listed, all their views are encoded and rebuilt,
+            also those that no episode shows (rooms behind the goal), and the gates are computed on all maps, poses
+            and actions alike; without it, on what was experienced.
+        variant: of the domain.
 
     Returns:
-        The gates on `reference` with the limits of its data (see `gates.evaluate`), `held_out` figures from
-        before any held-out map was learned from, `epochs`, `seconds`, `architecture`.
+        The gates with the limits of the data beside them (see `gates.evaluate`): views of all kinds, transitions
+        of the crossing task; `following`, the same for the transitions of the following task; `held_out`, figures
+        from before any held-out map was learned from; `epochs`, `seconds`, `architecture`.
 
     Raises:
         UserError: impossible settings, or no experience.
@@ -67,7 +71,7 @@ def train(
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # small networks: one thread is as fast, and sums are in the same order everywhere
     try:
-        return _train(experience, config, folder, seed, progress, views, reference)
+        return _train(experience, config, folder, seed, progress, domain, variant)
     finally:
         torch.set_num_threads(threads)
 
@@ -78,10 +82,12 @@ def _train(
     folder: Path,
     seed: int,
     progress: Progress,
-    views: np.ndarray | None,
-    reference: Transitions | None,
+    domain: Domain | None,
+    variant: str,
 ) -> dict[str, Any]:
-    everything = transitions_of(experience, views=views)
+    references = {} if domain is None else _references(domain, variant)
+    known = [reference.views for reference in references.values()]
+    everything = transitions_of(experience, views=np.concatenate(known) if known else None)
     training, held_out = everything, None
     if config.held_out > 0:
         apart = experience.held_out_maps(config.held_out, np.random.default_rng(seed))
@@ -106,7 +112,8 @@ def _train(
             bar.advance(1, **shown)
     codec = SymbolicCodec(trainer.model)
     metrics = {
-        **evaluate(codec, everything if reference is None else reference),
+        **evaluate(codec, references.get("crossing", everything), everything.views),
+        **({"following": evaluate(codec, references["following"])} if references else {}),
         "held_out": trainer.held_out_figures,
         "architecture": config.architecture,
         "epochs": tick,
@@ -114,6 +121,12 @@ def _train(
     }
     save_world_model(trainer.model, folder, metrics)
     return metrics
+
+
+def _references(domain: Domain, variant: str) -> dict[str, Transitions]:
+    """All transitions of both tasks, by task; empty where the maps of the variant are too many to list."""
+    found = {task: reference_transitions(domain, variant, task) for task in ("crossing", "following")}
+    return {task: transitions for task, transitions in found.items() if transitions is not None}
 
 
 def _check(config: TrainConfig, experience: Experience) -> None:
