@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import clingo
+import numpy as np
 
 from nesy.asp.facts import Facts, asp_name
 from nesy.asp.solver import Answer, solve
@@ -95,7 +96,7 @@ class KnowledgeBase:
             f"seen_of({name},{count},{len(book)})."
             for name, count in zip(self.facts.predicates, book.predicates.sum(axis=0).tolist(), strict=True)
         )
-        atoms = self._ask("meaning", f"asked({f},{value}). least({_percent(least)}). {totals} {facts}")
+        atoms = run_encoding(("meaning",), f"asked({f},{value}). least({_percent(least)}). {totals} {facts}")
         rows: list[dict[str, Any]] = [
             {
                 "relation": atom.name,
@@ -121,7 +122,7 @@ class KnowledgeBase:
         started = time.perf_counter()
         a = self.action(action)
         facts = self.facts.text(("taken", "changed", "parent"))
-        atoms = self._ask("influence", f"asked({self.facts.actions[a]}). {facts}")
+        atoms = run_encoding(("influence",), f"asked({self.facts.actions[a]}). {facts}")
         parents: dict[int, list[str]] = {i: [] for i in range(self.dbn.num_factors)}
         changes = dict.fromkeys(range(self.dbn.num_factors), (0, 0))
         for atom in atoms:
@@ -167,12 +168,12 @@ class KnowledgeBase:
         truth = book.predicate(predicate)
         name = asp_name(predicate)
         facts = "\n".join([*self.facts.cooccurs(predicates=(name,)), *self.facts.together(predicates=(name,))])
-        atoms = self._ask("implies", f"asked({name}). least({_percent(least)}). {facts}")
+        atoms = run_encoding(("implies",), f"asked({name}). least({_percent(least)}). {facts}")
         rows = []
         for atom in atoms:
             numbers = [argument.number for argument in atom.arguments]
             values = list(zip(numbers[:-2:2], numbers[1:-2:2], strict=True))
-            covered = np_all(book, values) & truth
+            covered = _having(book, values) & truth
             rows.append(
                 {
                     "values": [{"factor": self.dbn.factor_names[f], "value": v} for f, v in values],
@@ -186,6 +187,133 @@ class KnowledgeBase:
         chosen, rows = _greedy_cover(rows)
         text = self._implies_text(predicate, chosen, len(rows), int(truth.sum()), len(book))
         return self._finding(f"Which values mean that {predicate} holds?", text, rows, started)
+
+    # ---------------------------------------------------------------- steps, plans, beliefs
+    def rules(self, predicate: str, held_out: float = 0.25) -> Finding:
+        """Which rules over factor values say when a predicate holds?
+
+        Raises:
+            UserError: no such predicate.
+        """
+        from nesy.asp.semantics import asp_rules, predicate_rules, readable
+
+        started = time.perf_counter()
+        found = predicate_rules(self._book(), predicate, held_out, num_values=self.dbn.num_values)
+        row = {
+            "precision": found.precision,
+            "recall": found.recall,
+            "accuracy": found.accuracy,
+            "rules": len(found.rules),
+            "conditions": found.length,
+            "asp": asp_rules(found, f"now({asp_name(predicate)})", "at"),
+        }
+        text = readable(found, self.dbn.factor_names)
+        return self._finding(f"When does {predicate} hold?", text, [row], started)
+
+    def verify(self, action: int | str, premise: str, conclusion: str, codes: str = "all") -> Finding:
+        """Does `conclusion` hold after every possible step of an action from a code with `premise`?
+
+        Conditions are written as in nesy.asp.verification.
+
+        Args:
+            action: number or name of the action.
+            premise: conditions on the code before.
+            conclusion: conditions on the code after, or `same`.
+            codes: over `all` codes, or over those `met` in experience.
+
+        Raises:
+            UserError: a wrong action or condition.
+        """
+        from nesy.asp.verification import verify
+
+        started = time.perf_counter()
+        a = self.action(action)
+        verdict = verify(self.dbn, self.codebook, a, premise, conclusion, codes)
+        every = f"{self.dbn.num_values}^{self.dbn.num_factors} codes" if codes == "all" else "codes met"
+        head = f"'{self.dbn.action_names[a]}' with [{premise or 'anything'}] leads to [{conclusion}]"
+        if verdict.holds:
+            text = f"Proved over all {every}: {head}."
+        else:
+            text = f"Not so: {head} is broken by the step\n  {verdict.code}\n  {verdict.next_code}"
+        text += (
+            f"\n  (values less probable than {verdict.least:g} count as impossible; at most {verdict.dropped:.2g} "
+            "of a row is dropped by that)"
+        )
+        row = {
+            "holds": verdict.holds,
+            "code": list(verdict.code),
+            "next_code": list(verdict.next_code),
+            "dropped": verdict.dropped,
+        }
+        return self._finding(f"Is it so that {head}?", text, [row], started)
+
+    def plan(self, start: Sequence[int], goal: str, max_steps: int = 12, **options: Any) -> Finding:
+        """What is the shortest plan of most probable outcomes to a goal?
+
+        Args:
+            start: the code to start from.
+            goal: conditions as in nesy.asp.verification.
+            max_steps: longest plan looked for.
+            options: see nesy.asp.planning.find_plan.
+
+        Raises:
+            UserError: a wrong code, condition or rule.
+        """
+        from nesy.asp.planning import find_plan
+
+        started = time.perf_counter()
+        found = find_plan(self.dbn, self.codebook, np.asarray(start), goal, max_steps, **options)
+        row = asdict(found)
+        if found.actions is None:
+            text = f"No plan of at most {max_steps} steps of most probable outcomes leads to [{goal}]."
+        else:
+            text = (
+                f"{len(found.actions)} steps lead to [{goal}]: {', '.join(found.actions) or 'nothing to do'}\n"
+                f"  exactly these outcomes: probability {found.path_probability:.4f}; the goal holds at the end: "
+                f"{found.goal_probability:.4f} (a row lost at most {found.dropped:.2g})"
+            )
+        return self._finding(f"How to reach [{goal}]?", text, [row], started)
+
+    def after(self, start: Sequence[int], plan: Sequence[int | str]) -> Finding:
+        """What must, can and cannot hold after a plan?
+
+        Raises:
+            UserError: a wrong code or action.
+        """
+        from nesy.asp.planning import after
+
+        started = time.perf_counter()
+        actions = [self.action(a) for a in plan]
+        found = after(self.dbn, self._book(), np.asarray(start), actions)
+        likely = sorted(found.can.items(), key=lambda item: -item[1])[:MOST_LINES]
+        text = (
+            f"{found.codes} outcomes are possible (a row lost at most {found.dropped:.2g}).\n"
+            f"  must hold: {', '.join(found.must) or 'nothing'}\n"
+            f"  can hold: {', '.join(f'{name} ({p:.3f})' for name, p in likely) or 'nothing else'}\n"
+            f"  cannot hold: {len(found.cannot)} predicates"
+        )
+        names = ", ".join(self.dbn.action_names[a] for a in actions)
+        return self._finding(f"What holds after {names}?", text, [asdict(found)], started)
+
+    def knows(self, particles: Any, predicates: Sequence[str]) -> Finding:
+        """What does the holder of some particles (codes [n, N]) know, and hold possible?
+
+        Raises:
+            UserError: no particles, or no such predicate.
+        """
+        from nesy.asp.belief import BeliefQuestions
+        from nesy.asp.planning import PredicateTruth
+
+        started = time.perf_counter()
+        found = BeliefQuestions(PredicateTruth(self._book())).ask(particles, predicates)
+        lines = []
+        for name, k in found.items():
+            if k.knows or k.knows_not:
+                lines.append(f"{name}: known to be {'true' if k.knows else 'false'}")
+            else:
+                lines.append(f"{name}: may be true, may be false")
+        rows = [asdict(k) for k in found.values()]
+        return self._finding("What is known, what is possible?", "\n".join(lines), rows, started)
 
     # ---------------------------------------------------------------- any program
     def query(
@@ -263,16 +391,6 @@ class KnowledgeBase:
     def _share(self, constant: str) -> float:
         return round(float(self._book().predicates[:, self.facts.predicates.index(constant)].mean()), 4)
 
-    def _ask(self, encoding: str, facts: str) -> list[clingo.Symbol]:
-        """The shown atoms of one of our own encodings; no limits are needed, it is known to end."""
-        control = clingo.Control(["--warn=none"])
-        control.load(str(ENCODINGS / f"{encoding}.lp"))
-        control.add("base", [], facts)
-        control.ground([("base", [])])
-        atoms: list[clingo.Symbol] = []
-        control.solve(on_model=lambda model: atoms.extend(model.symbols(shown=True)))
-        return sorted(atoms)
-
     def _finding(self, question: str, text: str, rows: Sequence[dict[str, Any]], started: float) -> Finding:
         return Finding(question, text, tuple(rows), round(time.perf_counter() - started, 4))
 
@@ -317,7 +435,28 @@ class KnowledgeBase:
         return "\n".join(lines)
 
 
-def np_all(book: Codebook, values: Sequence[tuple[int, int]]) -> Any:
+def run_encoding(names: Sequence[str], facts: str, optimise: bool = False) -> list[clingo.Symbol]:
+    """The shown atoms of our own encodings on some facts; they are known to end, so no limits are needed.
+
+    Args:
+        names: the encodings.
+        facts: program text.
+        optimise: whether to look for the best model; otherwise the first will do.
+    """
+    options = ["--opt-mode=opt", "--models=0"] if optimise else ["--opt-mode=ignore", "--models=1"]
+    control = clingo.Control(["--warn=none", *options])
+    for name in names:
+        control.load(str(ENCODINGS / f"{name}.lp"))
+    control.add("base", [], facts)
+    control.ground([("base", [])])
+    atoms: list[clingo.Symbol] = []
+    with control.solve(yield_=True) as handle:
+        for model in handle:
+            atoms = list(model.symbols(shown=True))
+    return sorted(atoms)
+
+
+def _having(book: Codebook, values: Sequence[tuple[int, int]]) -> Any:
     """Which views have all the values (factor, value): bool [V]."""
     chosen = book.counts >= 0
     for factor, value in values:
