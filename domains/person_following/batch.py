@@ -10,12 +10,18 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from domains.core import GOAL, DomainError, ViewGeometry
+from domains.person_following import episodes
 from domains.person_following import rules as kernel
 from domains.person_following.random_numbers import seeded_stream
+from domains.person_following.starts import CORNER, Starts
 from domains.person_following.store import shared_store
-from domains.person_following.variants import CYCLED, DRAWN, GENERATED, Parameters, parameters_of
+from domains.person_following.variants import CYCLED, DRAWN, GENERATED, Parameters
 from domains.person_following.world import (
+    BELIEVED_X,
+    BELIEVED_Y,
     EPISODE,
+    GOAL_X,
+    GOAL_Y,
     HEADING,
     LOST,
     TIME,
@@ -41,22 +47,18 @@ class Batch:
         self,
         task: str,
         num_envs: int,
-        variant: str,
-        maps: NDArray[np.uint8] | None,
-        cycle: bool,
-        changes: dict[str, Any],
+        parameters: Parameters,
+        maps: NDArray[np.uint8] | None = None,
+        cycle: bool = False,
     ) -> None:
         """Allocate B environments.
 
         Raises:
-            DomainError: an unknown task, variant or parameter, or maps that cannot be played.
+            DomainError: an unknown task, or maps that cannot be played.
         """
-        if task not in TASKS:
-            raise DomainError(f"unknown task '{task}': known are {', '.join(TASKS)}")
         if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
             raise DomainError(f"num_envs must be a positive whole number, got {num_envs!r}")
-        self.task, self.variant = task, variant
-        self.parameters: Parameters = parameters_of(variant, task, **changes)
+        self.task, self.parameters = task, parameters
         self.geometry = ViewGeometry(self.parameters.view_size)
         self.num_envs = int(num_envs)
         size = self.parameters.size
@@ -69,6 +71,9 @@ class Batch:
         self.store = shared_store(size, self.parameters.heading_rule)
         self.world = allocate_world(self.num_envs, self.parameters)
         self.last = allocate_results(self.num_envs, self.parameters.view_size)
+        self.starts = Starts(self.parameters)
+        self._own = np.full(self.num_envs, -1, np.int64)
+        self._corner = np.full((self.num_envs, 2), CORNER, np.int64)
         self.seeded = False
 
     def checked_grid(self, grid: Any) -> NDArray[np.uint8]:
@@ -87,9 +92,11 @@ class Batch:
         border = np.concatenate([cells[0], cells[-1], cells[:, 0], cells[:, -1]])
         if (border != 1).any():
             raise DomainError("grid must have walls (1) all around its border")
-        if np.count_nonzero(cells == GOAL) != 1:
-            raise DomainError(f"grid must have exactly one goal (2), got {np.count_nonzero(cells == GOAL)}")
-        following = self.task == "following"
+        goals, most = np.count_nonzero(cells == GOAL), self.parameters.num_goals
+        if not 1 <= goals <= most:
+            wanted = "exactly one goal (2)" if most == 1 else f"1 to {most} goals (2)"
+            raise DomainError(f"grid must have {wanted}, got {goals}")
+        following = self.task == "following" and self.parameters.person_start == "corner"
         for name, x, y, needed in (("robot", 1, 1, True), ("person", 2, 2, following)):
             if not needed:
                 continue
@@ -129,10 +136,12 @@ class Batch:
         return lambda: self._begin(grid, None if waiting is None else int(waiting))
 
     def _begin(self, grid: NDArray[np.uint8] | None, waiting: int | None) -> None:
+        everywhere = np.ones(self.num_envs, np.bool_)
         if grid is not None:
             self.world.grid[:] = grid
-        everywhere = np.ones(self.num_envs, np.bool_)
-        kernel.begin_batch(self.rules, self.world, self.store, self.maps, everywhere, grid is not None, self.last)
+        else:
+            episodes.choose_batch(self.rules, self.world, self.maps, everywhere)
+        self._begin_where(everywhere)
         if self.task == "following":
             kernel.measure_batch(self.world, self.store, self.last.distance)
         else:
@@ -140,17 +149,41 @@ class Batch:
         if waiting is not None:
             self.world.person[:, WAITING] = waiting
 
+    def _begin_where(self, chosen: NDArray[np.bool_]) -> None:
+        """Begin episodes on the maps that lie in the grids."""
+        starts = self._corner
+        if self.parameters.person_start != "corner" and self.task == "following":
+            starts = self._corner.copy()
+            starts[chosen] = self.starts.of(self.world.grid[chosen])
+        episodes.begin_batch(self.rules, self.world, self.store, chosen, starts, self._own, self.last)
+
     def step(self, actions: NDArray[np.int64], autoreset: bool) -> None:
         """Take a step everywhere; the results lie in `last`, which is new every time."""
-        self.last = allocate_results(self.num_envs, self.parameters.view_size)
-        last = self.last
+        self.last = last = allocate_results(self.num_envs, self.parameters.view_size)
         ended = kernel.step_batch(self.rules, self.world, self.store, actions, last)
         if autoreset and ended:
             last.robot_view[:] = last.final_view
             last.configuration[:] = last.final_configuration
-            kernel.begin_batch(self.rules, self.world, self.store, self.maps, last.ended, False, last)
+            episodes.choose_batch(self.rules, self.world, self.maps, last.ended)
+            self._begin_where(last.ended)
         else:
             self.last = last._replace(robot_view=last.final_view, configuration=last.final_configuration)
+
+    def follower_succeeds(self, grid: NDArray[np.uint8], starts: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether a greedy follower succeeds [B] on one map, the person at each of some starts [B, 2]."""
+        self.world.grid[:] = grid
+        everywhere = np.ones(self.num_envs, np.bool_)
+        self.world.stream[:] = seeded_stream(0)
+        own = np.zeros(self.num_envs, np.int64)
+        episodes.begin_batch(self.rules, self.world, self.store, everywhere, starts, own, self.last)
+        won, running = np.zeros(self.num_envs, np.bool_), everywhere.copy()
+        for _ in range(self.parameters.max_steps):
+            self.step(self.expert("follower"), False)
+            won |= running & (self.last.outcome == kernel.SUCCESS)
+            running &= ~self.last.ended
+            if not running.any():
+                break
+        return won
 
     def describe(self) -> tuple[NDArray[np.uint8], NDArray[np.int16], NDArray[np.int16]]:
         """Person views, relative poses and counters of the present states; crossing has no person."""
@@ -184,16 +217,22 @@ class Batch:
     def state(self, index: int) -> dict[str, Any]:
         """The full state of one environment, as plain numbers and a copy of the grid."""
         robot, person = self.world.robot[index], self.world.person[index]
-        goal_x, goal_y = np.argwhere(self.world.grid[index] == GOAL)[0]
-        return {
+        state = {
             "grid": self.world.grid[index].copy(),
             "agent": (int(robot[X]), int(robot[Y]), int(robot[HEADING])),
             "person": (int(person[X]), int(person[Y]), int(person[HEADING])),
-            "goal": (int(goal_x), int(goal_y)),
+            "goal": (int(person[GOAL_X]), int(person[GOAL_Y])),
             "waiting": int(person[WAITING]),
             "lost": int(robot[LOST]),
             "t": int(robot[TIME]),
         }
+        if self.parameters.num_goals > 1:
+            state["believed_goal"] = (int(person[BELIEVED_X]), int(person[BELIEVED_Y]))
+        if self.parameters.person_knows == "seen" and self.task == "following":
+            state["known"] = self.world.known[index].copy()
+        if self.parameters.num_persons > 1:
+            state["others"] = [(int(x), int(y), int(h)) for x, y, h in self.world.others[index, :, :3]]
+        return state
 
 
 def _reaches_goal(grid: NDArray[np.uint8], x: int, y: int) -> bool:
@@ -209,6 +248,17 @@ def _reaches_goal(grid: NDArray[np.uint8], x: int, y: int) -> bool:
                 seen.add((nx, ny))
                 frontier.append((nx, ny))
     return False
+
+
+def checked_task(task: str) -> str:
+    """The task, if there is one of that name.
+
+    Raises:
+        DomainError: there is none.
+    """
+    if task not in TASKS:
+        raise DomainError(f"unknown task '{task}': known are {', '.join(TASKS)}")
+    return task
 
 
 def observation_space(geometry: ViewGeometry) -> spaces.Dict:

@@ -10,8 +10,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from domains.core import OUTCOMES, ViewGeometry
-from domains.person_following.batch import NUM_ACTIONS, Batch, checked_actions, observation_space
+from domains.person_following.batch import NUM_ACTIONS, Batch, checked_actions, checked_task, observation_space
 from domains.person_following.random_numbers import stream_of, write_back
+from domains.person_following.variants import parameters_of
 
 
 class PersonFollowingEnv(gymnasium.Env):
@@ -33,7 +34,7 @@ class PersonFollowingEnv(gymnasium.Env):
         **parameters: Any,
     ) -> None:
         """Make an environment of a variant, with single parameters changed by keyword."""
-        self.batch = Batch(task, 1, variant, maps, cycle, parameters)
+        self.batch = Batch(task, 1, parameters_of(variant, checked_task(task), **parameters), maps, cycle)
         self.observation_space = observation_space(self.batch.geometry)
         self.action_space = spaces.Discrete(NUM_ACTIONS)
         self.render_mode = render_mode

@@ -1,4 +1,4 @@
-"""The rules of the task, compiled: beginning episodes and taking steps, for one or many environments.
+"""The rules of the task, compiled: one step, for one or many environments.
 
     S   map, poses of robot and person, the person's plan and waiting counter, lost counter, time
     A   left, right, forward, stay
@@ -13,39 +13,30 @@ slices would be counted references, which cost more than the rules themselves.
 
 from __future__ import annotations
 
-from domains.core import EMPTY, FORWARD, GOAL, LEFT, RIGHT, STAY, WALL
+from domains.core import FORWARD, GOAL, LEFT, RIGHT, STAY, WALL
 from domains.person_following.compiled import entry, inner
-from domains.person_following.map_generation import generate_crossing
-from domains.person_following.paths import HEADING_ALWAYS, HEADING_NEVER, astar, step_x, step_y
-from domains.person_following.random_numbers import draw_below
-from domains.person_following.store import distance, enter_map, first_action, first_action_to_goal, map_hash
+from domains.person_following.paths import HEADING_ALWAYS, HEADING_NEVER, step_x, step_y
+from domains.person_following.people import move_goals, move_others, move_persons
+from domains.person_following.store import distance, first_action, first_action_to_goal
 from domains.person_following.variants import (
-    DRAWN,
-    GENERATED,
     R_FOLLOW_DISTANCE,
     R_FOLLOWING,
+    R_GOAL_MOVES_AT,
     R_GOAL_PATIENCE,
-    R_KEEP_WAITING,
     R_LOOK_BACK,
-    R_MAP_SOURCE,
     R_MAX_LOST,
     R_MAX_STEPS,
-    R_NUM_CROSSINGS,
-    R_PERSON_REST,
     R_ROBOT_REST,
     R_SEE_THROUGH,
 )
 from domains.person_following.views import configuration_of, look, relative
 from domains.person_following.world import (
     AT_GOAL,
-    EPISODE,
     GOAL_X,
     GOAL_Y,
     HEADING,
     LAST_ACTION,
     LOST,
-    PLAN_AT,
-    PLAN_LENGTH,
     SLOT,
     TIME,
     WAITING,
@@ -56,18 +47,18 @@ from domains.person_following.world import (
 SUCCESS, AGENT_AT_GOAL, LOST_PERSON, UNESCORTED, TIMEOUT = 1, 2, 3, 4, 5
 """Indices into `domains.core.OUTCOMES`."""
 
-NO_ACTION = -1
-
 
 @inner
-def _move_robots(rules, time_rests, grid, robot, person, actions, out):  # type: ignore[no-untyped-def]
+def _move_robots(rules, world, actions, out):  # type: ignore[no-untyped-def]
     """The robots' part of a step; `out.acted` gets what they did, `out.entered` who entered the goal."""
+    grid, robot, person, others = world.grid, world.robot, world.person, world.others
     acted, entered = out.acted, out.entered
+    rest = rules[R_ROBOT_REST]
     following = rules[R_FOLLOWING] != 0
     for b in range(actions.shape[0]):
         robot[b, TIME] += 1
         action = actions[b]
-        if time_rests > 0 and robot[b, TIME] % time_rests == 0:
+        if rest > 0 and robot[b, TIME] % rest == 0:
             action = STAY
         acted[b] = action
         entered[b] = False
@@ -80,6 +71,8 @@ def _move_robots(rules, time_rests, grid, robot, person, actions, out):  # type:
             x = robot[b, X] + step_x(heading)
             y = robot[b, Y] + step_y(heading)
             blocked = following and person[b, X] == x and person[b, Y] == y
+            for k in range(others.shape[1]):
+                blocked = blocked or (others[b, k, X] == x and others[b, k, Y] == y)
             if grid[b, x, y] != WALL and not blocked:
                 robot[b, X], robot[b, Y] = x, y
                 entered[b] = grid[b, x, y] == GOAL
@@ -141,54 +134,6 @@ def _measure(store, grid, robot, person, gaps):  # type: ignore[no-untyped-def]
             gaps[b] = max(table[row, (robot[b, X] * size + robot[b, Y]) * 4 + robot[b, HEADING]], 0)
         else:
             gaps[b] = _gap(store, grid, robot, person, b)
-
-
-@inner
-def _plan(world, store, b):  # type: ignore[no-untyped-def]
-    """Make person b a new plan from where it stands to its goal; at the goal, to turn about twice."""
-    person, plan = world.person, world.plan
-    x, y, heading = person[b, X], person[b, Y], person[b, HEADING]
-    goal_x, goal_y = person[b, GOAL_X], person[b, GOAL_Y]
-    length = astar(world.grid, b, x, y, heading, goal_x, goal_y, -1, False, store.scratch)
-    path = store.scratch.path
-    if length > 0:
-        for i in range(length):
-            plan[b, i] = path[i]
-    else:
-        length = 2
-        turn = LEFT if draw_below(world.stream, b, 2) == 0 else RIGHT
-        plan[b, 0] = turn
-        plan[b, 1] = turn
-    person[b, PLAN_AT], person[b, PLAN_LENGTH] = 0, length
-
-
-@inner
-def _move_persons(rules, world, store, configurations, gaps):  # type: ignore[no-untyped-def]
-    """The persons' part of a step; what they do is kept as LAST_ACTION."""
-    robot, person, plan = world.robot, world.person, world.plan
-    rest, look_back, limit = rules[R_PERSON_REST], rules[R_LOOK_BACK] != 0, rules[R_FOLLOW_DISTANCE]
-    for b in range(gaps.shape[0]):
-        person[b, LAST_ACTION] = STAY
-        if rest > 0 and robot[b, TIME] % rest == 0:
-            continue
-        if look_back and (configurations[b] == 0 or gaps[b] > limit):
-            person[b, WAITING] += 1
-            if person[b, WAITING] < 3:
-                continue
-        person[b, WAITING] = 0
-        if person[b, PLAN_AT] >= person[b, PLAN_LENGTH]:
-            _plan(world, store, b)
-        action = plan[b, person[b, PLAN_AT]]
-        person[b, PLAN_AT] += 1
-        person[b, LAST_ACTION] = action
-        heading = person[b, HEADING]
-        if action == LEFT:
-            person[b, HEADING] = (heading + 3) & 3
-        elif action == RIGHT:
-            person[b, HEADING] = (heading + 1) & 3
-        else:
-            person[b, X] += step_x(heading)
-            person[b, Y] += step_y(heading)
 
 
 @inner
@@ -260,76 +205,6 @@ def _judge_crossing(rules, robot, out):  # type: ignore[no-untyped-def]
         out.distance[b], out.visible[b], out.final_configuration[b] = 0, False, 0
 
 
-@inner
-def _choose_map(rules, world, maps, b):  # type: ignore[no-untyped-def]
-    """Put the map of environment b's next episode into its grid."""
-    grid = world.grid
-    source = rules[R_MAP_SOURCE]
-    if source == GENERATED:
-        generate_crossing(world.stream, grid, b, rules[R_NUM_CROSSINGS])
-    else:
-        if source == DRAWN:
-            chosen = draw_below(world.stream, b, maps.shape[0])
-        else:
-            chosen = (b + world.robot[b, EPISODE] * grid.shape[0]) % maps.shape[0]
-        for x in range(maps.shape[1]):
-            for y in range(maps.shape[2]):
-                grid[b, x, y] = maps[chosen, x, y]
-    world.robot[b, EPISODE] += 1
-
-
-@inner
-def _begin(rules, world, store, b):  # type: ignore[no-untyped-def]
-    """Start an episode of environment b on the map that lies in its grid."""
-    grid, robot, person, plan = world.grid, world.robot, world.person, world.plan
-    size = grid.shape[1]
-    robot[b, X], robot[b, Y], robot[b, HEADING] = 1, 1, 0
-    robot[b, LOST], robot[b, TIME], robot[b, AT_GOAL] = 0, 0, 0
-    person[b, LAST_ACTION] = NO_ACTION
-    if not rules[R_KEEP_WAITING]:
-        person[b, WAITING] = 0
-    goal_x, goal_y = 0, 0
-    for x in range(size):
-        for y in range(size):
-            if grid[b, x, y] == GOAL:
-                goal_x, goal_y = x, y
-    person[b, GOAL_X], person[b, GOAL_Y] = goal_x, goal_y
-    person[b, X], person[b, Y], person[b, HEADING] = 2, 2, 0
-    if rules[R_FOLLOWING]:
-        # The person replaces whatever stood on its cell, and leaves it empty.
-        grid[b, 2, 2] = EMPTY
-    map_id = map_hash(grid, b)
-    world.map_id[b] = map_id
-    slot = enter_map(store, grid, b, map_id, 2, 2, 0, goal_x, goal_y)
-    robot[b, SLOT] = slot
-    person[b, PLAN_AT] = 0
-    if slot >= 0:
-        length = store.plan_length[slot]
-        person[b, PLAN_LENGTH] = length
-        for i in range(length):
-            plan[b, i] = store.plan[slot, i]
-    elif rules[R_FOLLOWING]:
-        _plan(world, store, b)
-
-
-@entry
-def begin_batch(rules, world, store, maps, chosen, given, out):  # type: ignore[no-untyped-def]
-    """Begin episodes where `chosen` [B]; on the map already in the grid if `given`, else on a new one."""
-    grid, robot, person = world.grid, world.robot, world.person
-    see_through = rules[R_SEE_THROUGH] != 0
-    views, configurations = out.robot_view, out.configuration
-    for b in range(chosen.shape[0]):
-        if not chosen[b]:
-            continue
-        if not given:
-            _choose_map(rules, world, maps, b)
-        _begin(rules, world, store, b)
-        look(grid, b, robot[b, X], robot[b, Y], robot[b, HEADING], see_through, views, b)
-        configurations[b] = 0
-        if rules[R_FOLLOWING]:
-            configurations[b] = _configure_one(see_through, robot, person, views, b)
-
-
 @entry
 def measure_batch(world, store, gaps):  # type: ignore[no-untyped-def]
     """Distances [B] from the robots to the persons in the present states."""
@@ -342,13 +217,17 @@ def step_batch(rules, world, store, actions, out):  # type: ignore[no-untyped-de
     grid, robot, person = world.grid, world.robot, world.person
     see_through = rules[R_SEE_THROUGH] != 0
     views, configurations = out.final_view, out.final_configuration
-    _move_robots(rules, rules[R_ROBOT_REST], grid, robot, person, actions, out)
+    if rules[R_GOAL_MOVES_AT]:
+        move_goals(rules, world)
+    _move_robots(rules, world, actions, out)
     _look(see_through, grid, robot, views)
     if rules[R_FOLLOWING]:
         if rules[R_LOOK_BACK]:
             _configure(see_through, robot, person, views, configurations)
             _measure(store, grid, robot, person, out.distance)
-        _move_persons(rules, world, store, configurations, out.distance)
+        move_persons(rules, world, store, configurations, out.distance)
+        if world.others.shape[1] > 0:
+            move_others(world, store)
         _configure(see_through, robot, person, views, configurations)
         _measure(store, grid, robot, person, out.distance)
         _judge(rules, robot, person, out)

@@ -94,7 +94,7 @@ def map_hash(grids, b):  # type: ignore[no-untyped-def]
 def enter_map(store, grids, b, grid_hash, x, y, heading, goal_x, goal_y):  # type: ignore[no-untyped-def]
     """Slot of a map with a person's start and goal, its plan computed; -1 where the store is full."""
     size = grids.shape[1]
-    extra = (x, y, heading, goal_x, goal_y)
+    extra = (np.int64(x), np.int64(y), np.int64(heading), np.int64(goal_x), np.int64(goal_y))
     mixed = np.uint64(grid_hash)
     for value in extra:
         mixed = (mixed ^ np.uint64(value)) * np.uint64(0x100000001B3)

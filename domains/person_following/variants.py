@@ -28,15 +28,22 @@ from domains.person_following.paths import HEADING_ALWAYS, HEADING_NEVER, HEADIN
     R_KEEP_WAITING,
     R_FOLLOWING,
     R_MAP_SOURCE,
+    R_NUM_GOALS,
+    R_PERSON_SEES_ONLY,
+    R_GOAL_MOVES_AT,
+    R_TURNS_AT_GOAL,
     NUM_RULES,
-) = range(14)
+) = range(18)
 
 GENERATED, DRAWN, CYCLED = 0, 1, 2
 """Where the maps of new episodes come from (R_MAP_SOURCE)."""
 
-START_CORNER, START_FREE = 0, 1
+START_CORNER, START_NEAR, START_FREE = 0, 1, 2
+MAX_GOALS = 4
+MAX_PERSONS = 8
 _HEADINGS = {"never": HEADING_NEVER, "always": HEADING_ALWAYS, "unless-0": HEADING_UNLESS_0}
-_STARTS = {"corner": START_CORNER, "free": START_FREE}
+_STARTS = {"corner": START_CORNER, "near": START_NEAR, "free": START_FREE}
+_KNOWLEDGE = ("map", "seen")
 
 
 @dataclass(frozen=True)
@@ -70,8 +77,20 @@ class Parameters:
     """Steps the person stands at its goal before the episode ends unescorted where the robot is too far."""
     compare_heading: Literal["never", "always", "unless-0"] = "unless-0"
     """When a path to the person must end in its heading; `unless-0` is the quirk of the paper."""
-    person_start: Literal["corner", "free"] = "corner"
-    """`corner`: at (2, 2), cutting a wall there (the quirk of the paper); `free`: on a free cell."""
+    person_start: Literal["corner", "near", "free"] = "corner"
+    """`corner`: at (2, 2), cutting a wall there (the quirk of the paper); `near`: on the free cell nearest to
+    it; `free`: on the nearest one from which a greedy follower succeeds."""
+    num_goals: int = 1
+    """Cells that show as goals, 1 to 4; which one is the person's own is drawn, and only the person knows."""
+    person_knows: Literal["map", "seen"] = "map"
+    """`map`: the person plans on the true map; `seen`: on what it has seen, taking unseen cells as free."""
+    goal_moves_at: int = 0
+    """t at whose beginning the person's goal moves to the next candidate, unless the person sees the old
+    place; 0 for never."""
+    turns_at_goal: bool = True
+    """Whether a person at its goal turns about at random, or stands still."""
+    num_persons: int = 1
+    """Persons in the map; the first is to be followed, the others walk about and stand in the way."""
     keep_waiting: bool = True
     """Whether the waiting counter lives on into the next episode (the quirk of the paper)."""
 
@@ -98,13 +117,21 @@ class Parameters:
         for name in ("max_steps", "max_lost"):
             if getattr(self, name) < 1:
                 raise DomainError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("follow_distance", "person_rest", "robot_rest", "goal_patience"):
+        for name, most in (("num_goals", MAX_GOALS), ("num_persons", MAX_PERSONS)):
+            if not 1 <= getattr(self, name) <= most:
+                raise DomainError(f"{name} must be in 1..{most}, got {getattr(self, name)}")
+        if self.goal_moves_at > 0 and self.num_goals < 2:
+            raise DomainError("goal_moves_at needs num_goals of at least 2: the goal moves to another candidate")
+        if self.num_goals > 1 and self.person_start == "corner":
+            raise DomainError("num_goals above 1 needs person_start 'near' or 'free'")
+        for name in ("follow_distance", "person_rest", "robot_rest", "goal_patience", "goal_moves_at"):
             if getattr(self, name) < 0:
                 raise DomainError(f"{name} must not be negative, got {getattr(self, name)}")
         for name in ("person_rest", "robot_rest"):
             if getattr(self, name) == 1:
                 raise DomainError(f"{name} must be 0 (never) or at least 2, got 1: nobody would ever move")
-        for name, known in (("compare_heading", _HEADINGS), ("person_start", _STARTS)):
+        choices = (("compare_heading", _HEADINGS), ("person_start", _STARTS), ("person_knows", _KNOWLEDGE))
+        for name, known in choices:
             if getattr(self, name) not in known:
                 raise DomainError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
 
@@ -128,12 +155,31 @@ class Parameters:
         rules[R_PERSON_START] = _STARTS[self.person_start]
         rules[R_KEEP_WAITING] = self.keep_waiting
         rules[R_FOLLOWING] = following
+        rules[R_NUM_GOALS] = self.num_goals if following else 1
+        rules[R_PERSON_SEES_ONLY] = self.person_knows == "seen"
+        rules[R_GOAL_MOVES_AT] = self.goal_moves_at
+        rules[R_TURNS_AT_GOAL] = self.turns_at_goal
         rules[R_MAP_SOURCE] = map_source
         return rules
 
 
+_CLEAN: dict[str, Any] = {"compare_heading": "always", "person_start": "free", "keep_waiting": False}
+_OCCLUDED = _CLEAN | {"see_through_walls": False, "size": 13, "num_crossings": 3, "look_back": False}
+_INTENT = _OCCLUDED | {
+    "person_start": "near",
+    "compare_heading": "never",
+    "turns_at_goal": False,
+    "num_goals": 3,
+    "robot_rest": 4,
+    "max_lost": 10,
+    "goal_patience": 4,
+}
 VARIANTS: dict[str, dict[str, Any]] = {
     "paper": {},
+    "clean": _CLEAN,
+    "occluded": _OCCLUDED,
+    "intent": _INTENT,
+    "false_belief": _INTENT | {"num_goals": 2, "goal_moves_at": 8},
 }
 
 

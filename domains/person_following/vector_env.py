@@ -12,8 +12,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from domains.core import OUTCOMES, DomainError, ViewGeometry
-from domains.person_following.batch import NUM_ACTIONS, Batch, checked_actions, observation_space
-from domains.person_following.variants import Parameters
+from domains.person_following.batch import NUM_ACTIONS, Batch, checked_actions, checked_task, observation_space
+from domains.person_following.variants import Parameters, parameters_of
 from domains.person_following.world import LAST_ACTION, LOST, TIME, WAITING
 
 _OUTCOME_NAMES = np.array(OUTCOMES)
@@ -40,7 +40,7 @@ class PersonFollowingVectorEnv(VectorEnv):
         """Make a batch; see `domains.core.Domain.make` for `maps` and `cycle`, `Parameters` for the rest."""
         if render_mode is not None:
             raise DomainError("a batched environment is not rendered: use gymnasium.make for one that is")
-        self.batch = Batch(task, num_envs, variant, maps, cycle, parameters)
+        self.batch = Batch(task, num_envs, parameters_of(variant, checked_task(task), **parameters), maps, cycle)
         self.num_envs = self.batch.num_envs
         self.single_observation_space = observation_space(self.batch.geometry)
         self.single_action_space = spaces.Discrete(NUM_ACTIONS)

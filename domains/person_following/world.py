@@ -9,12 +9,22 @@ from numpy.typing import NDArray
 
 from domains.person_following.random_numbers import STREAM_WIDTH
 from domains.person_following.store import longest_plan
-from domains.person_following.variants import Parameters
+from domains.person_following.variants import MAX_GOALS, Parameters
 
 # Columns of `World.robot`; SLOT is the map's place in the store, AT_GOAL counts steps of the person at its goal.
 X, Y, HEADING, LOST, TIME, SLOT, EPISODE, AT_GOAL, ROBOT_COLUMNS = range(9)
 # Columns of `World.person`; the first three are X, Y, HEADING too.
-WAITING, PLAN_AT, PLAN_LENGTH, GOAL_X, GOAL_Y, LAST_ACTION, PERSON_COLUMNS = range(3, 10)
+(
+    WAITING,
+    PLAN_AT,
+    PLAN_LENGTH,
+    GOAL_X,
+    GOAL_Y,
+    LAST_ACTION,
+    BELIEVED_X,
+    BELIEVED_Y,
+    PERSON_COLUMNS,
+) = range(3, 12)
 
 
 class World(NamedTuple):
@@ -24,6 +34,11 @@ class World(NamedTuple):
     robot: NDArray[np.int32]  # [B, ROBOT_COLUMNS]: see above
     person: NDArray[np.int32]  # [B, PERSON_COLUMNS]
     plan: NDArray[np.int8]  # [B, longest plan]: the person's actions
+    known: NDArray[np.uint8]  # [B, size, size]: cells as the person believes them; [0, ...] where it knows all
+    sight: NDArray[np.uint8]  # [B, v, v]: the persons' views, where the rules need them
+    others: NDArray[np.int32]  # [B, N - 1, PERSON_COLUMNS]: persons who are not to be followed
+    other_plan: NDArray[np.int8]  # [B, N - 1, longest plan]
+    goals: NDArray[np.int32]  # [B, MAX_GOALS, 2]: candidate cells, the first `num_goals` of them in use
     stream: NDArray[np.uint64]  # [B, 6]: random streams
     map_id: NDArray[np.int64]  # [B]
 
@@ -58,6 +73,11 @@ def allocate_world(num_envs: int, parameters: Parameters) -> World:
         robot=np.zeros((num_envs, ROBOT_COLUMNS), np.int32),
         person=np.zeros((num_envs, PERSON_COLUMNS), np.int32),
         plan=np.zeros((num_envs, longest_plan(size)), np.int8),
+        known=np.zeros((num_envs if parameters.person_knows == "seen" else 0, size, size), np.uint8),
+        sight=np.zeros((num_envs, parameters.view_size, parameters.view_size), np.uint8),
+        others=np.zeros((num_envs, parameters.num_persons - 1, PERSON_COLUMNS), np.int32),
+        other_plan=np.zeros((num_envs, parameters.num_persons - 1, longest_plan(size)), np.int8),
+        goals=np.zeros((num_envs, MAX_GOALS, 2), np.int32),
         stream=np.zeros((num_envs, STREAM_WIDTH), np.uint64),
         map_id=np.zeros(num_envs, np.int64),
     )
