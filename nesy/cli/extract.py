@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import tyro
 
 from nesy.cli import pipeline, tables
+from nesy.cli.show import selection
 from nesy.config import ExtractConfig
-from nesy.errors import UserError
 from nesy.run_folder import RunFolder
 
 
@@ -60,12 +60,8 @@ def _table(run: RunFolder, options: Arguments) -> str:
     from nesy.dbn import TwoSliceDBN, describe
 
     dbn = TwoSliceDBN.load(run.dbn)
-    if options.action is not None and options.action not in dbn.action_names:
-        raise UserError(f"--action {options.action}: no such action; the actions are {', '.join(dbn.action_names)}")
-    if options.factor is not None and not 0 <= options.factor < len(dbn.factor_names):
-        raise UserError(f"--factor {options.factor}: no such factor; the factors are 0 to {len(dbn.factor_names) - 1}")
-    action = None if options.action is None else dbn.action_names.index(options.action)
-    return describe(dbn, factor=options.factor, action=action)
+    factor, action = selection(dbn, options.factor, options.action)
+    return describe(dbn, factor=factor, action=action)
 
 
 def show(result: dict[str, Any]) -> None:

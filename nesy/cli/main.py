@@ -23,8 +23,10 @@ COMMANDS = {
     "train": "train the discrete world model",
     "extract": "extract the symbolic 2DBN, print it, write it in other formats",
     "query": "ask what factors and values mean, and run any ASP program over the model",
+    "show": "print or draw the 2DBN: its graph, its tables, what the values of a factor look like",
     "compare": "compare DQN, POMDP planner and references on the same maps",
     "report": "write report.html from the run folder",
+    "play": "drive the robot in a terminal, watch a policy, record an episode",
 }
 
 
