@@ -227,6 +227,8 @@ class Batch:
             "t": int(robot[TIME]),
         }
         if self.parameters.num_goals > 1:
+            goals = self.world.goals[index, : self.parameters.num_goals].tolist()
+            state["goals"] = [(x, y) for x, y in goals]
             state["believed_goal"] = (int(person[BELIEVED_X]), int(person[BELIEVED_Y]))
         if self.parameters.person_knows == "seen" and self.task == "following":
             state["known"] = self.world.known[index].copy()

@@ -32,12 +32,14 @@ def compare_play(env, reference: Reference, player: str, steps: int, seed: int) 
     outcomes: dict[str, int] = {}
     turn = {"draw": None}
     reference.random_turn = lambda: turn["draw"]
-    begun = False
+    begun, moved = False, 0
     for _ in range(steps):
         if not begun:
             observation, info = env.reset(seed=seed if not outcomes else None)
             state = inner.state()
-            view, configuration = reference.reset(state["grid"], person=state["person"])
+            view, configuration = reference.reset(
+                state["grid"], person=state["person"], goal=state["goal"], goals=state.get("goals")
+            )
             assert observation["view"].tolist() == view
             assert observation["configuration"] == configuration
             assert info["distance"] == reference.distance()
@@ -63,8 +65,14 @@ def compare_play(env, reference: Reference, player: str, steps: int, seed: int) 
         assert state["person"] == reference.person
         assert state["goal"] == reference.goal
         assert state["grid"].tolist() == reference.grid
+        if "believed_goal" in state:
+            assert state["believed_goal"] == reference.believed
+        if "known" in state:
+            assert state["known"].tolist() == reference.known
         assert (state["waiting"], state["lost"], state["t"]) == (reference.waiting, reference.lost, reference.t)
+        moved += reference.believed != reference.goal
         if terminated or truncated:
             outcomes[outcome] = outcomes.get(outcome, 0) + 1
             begun = False
+    outcomes["steps of false belief"] = moved
     return outcomes

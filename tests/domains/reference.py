@@ -109,13 +109,17 @@ class Reference:
         goal_patience=0,
         compare_heading="unless-0",
         keep_waiting=True,
+        person_knows="map",
+        goal_moves_at=0,
+        turns_at_goal=True,
+        **_,
     ):
-        self.__dict__.update({k: v for k, v in locals().items() if k != "self"})
+        self.__dict__.update({k: v for k, v in locals().items() if k not in ("self", "_")})
         self.waiting = 0
 
-    def reset(self, grid, waiting=None, person=(2, 2, 0)):
+    def reset(self, grid, waiting=None, person=(2, 2, 0), goal=None, goals=None):
         self.grid = [[int(cell) for cell in column] for column in grid]
-        self.goal = next((x, y) for x, column in enumerate(self.grid) for y, c in enumerate(column) if c == 2)
+        self.goal = goal or next((x, y) for x, column in enumerate(self.grid) for y, c in enumerate(column) if c == 2)
         self.agent = (1, 1, 0)
         self.person = person
         self.grid[person[0]][person[1]] = 0
@@ -124,7 +128,14 @@ class Reference:
         if waiting is not None:
             self.waiting = waiting
         self.t = self.lost = self.at_goal = 0
-        self.plan = astar(self.grid, self.person, self.goal, None, False) or []
+        self.goals = goals or [self.goal]
+        self.believed = self.goal
+        n = len(self.grid)
+        edge = (0, n - 1)
+        self.known = [[1 if x in edge or y in edge else 0 for y in range(n)] for x in range(n)]
+        if self.person_knows == "seen":
+            self.person_learns()
+        self.plan = self.person_plans()
         return self.observe()
 
     def distance(self):
@@ -168,6 +179,9 @@ class Reference:
     def step(self, action):
         """(observation, reward, terminated, truncated, outcome, person's action)."""
         self.t += 1
+        if self.t == self.goal_moves_at and not self.person_sees(self.goal):
+            self.grid[self.goal[0]][self.goal[1]] = 0
+            self.goal = self.goals[(self.goals.index(self.goal) + 1) % len(self.goals)]
         if self.robot_rest and self.t % self.robot_rest == 0:
             action = STAY
         x, y, h = self.agent
@@ -228,7 +242,11 @@ class Reference:
                 return STAY
         self.waiting = 0
         if not self.plan:
-            self.plan = astar(self.grid, self.person, self.goal, None, False) or [self.random_turn()] * 2
+            self.plan = self.person_plans()
+            if not self.plan and self.turns_at_goal:
+                self.plan = [self.random_turn()] * 2
+            if not self.plan:
+                return STAY
         action = self.plan.pop(0)
         x, y, h = self.person
         if action == LEFT:
@@ -237,7 +255,47 @@ class Reference:
             self.person = (x, y, (h + 1) % 4)
         else:
             self.person = (x + STEPS[h][0], y + STEPS[h][1], h)
+        self.person_learns()
         return action
+
+    def person_plans(self):
+        grid = self.known if self.person_knows == "seen" else self.grid
+        return astar(grid, self.person, self.believed, None, False) or []
+
+    def seen_cells(self):
+        """Map cells that the person sees, its own included."""
+        x, y, h = self.person
+        fx, fy = STEPS[h]
+        rx, ry = STEPS[(h + 1) % 4]
+        view = self.person_view()
+        cells = set()
+        for vx in range(self.view_size):
+            for vy in range(self.view_size):
+                side, ahead = vx - self.view_size // 2, self.view_size - 1 - vy
+                if view[vx][vy] != 3:
+                    cells.add((x + ahead * fx + side * rx, y + ahead * fy + side * ry))
+        return {(cx, cy) for cx, cy in cells if 0 <= cx < len(self.grid) and 0 <= cy < len(self.grid)}
+
+    def person_sees(self, cell):
+        return cell in self.seen_cells()
+
+    def person_learns(self):
+        """Keep what is seen; give up a plan that leads through a seen wall, and a goal seen to be gone."""
+        if self.person_knows == "seen":
+            for x, y in self.seen_cells():
+                self.known[x][y] = self.grid[x][y]
+            x, y, h = self.person
+            for action in getattr(self, "plan", None) or []:
+                if action == FORWARD:
+                    x, y = x + STEPS[h][0], y + STEPS[h][1]
+                    if self.known[x][y] == 1:
+                        self.plan = []
+                        break
+                else:
+                    h = (h + (-1 if action == LEFT else 1)) % 4
+        if self.goal_moves_at and self.believed != self.goal and self.person_sees(self.believed):
+            self.believed = self.goal
+            self.plan = []
 
 
 def plain_grid(kernel_grid):

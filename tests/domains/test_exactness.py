@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import gymnasium
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from minigrid.envs.crossing import CrossingEnv
 import domains  # noqa: F401
 from domains.person_following.map_generation import generate_crossing
 from domains.person_following.random_numbers import seeded_stream, stream_of, write_back
+from domains.person_following.variants import parameters_of
 from tests.domains.play import compare_play
 from tests.domains.reference import Reference
 
@@ -43,6 +46,19 @@ def test_changed_rules_equal_the_reference(changes):
     rules = {k: v for k, v in changes.items() if k not in ("size", "num_crossings")}
     compare_play(env, Reference(None, **rules), "mixed", STEPS // 2, seed=3)
     compare_play(env, Reference(None, **rules), "adversarial", STEPS // 2, seed=4)
+
+
+@pytest.mark.parametrize("variant", ["clean", "occluded", "intent", "false_belief"])
+@pytest.mark.parametrize("knows", ["map", "seen"])
+def test_variants_equal_the_reference(variant, knows):
+    env = gymnasium.make("nesy/PersonFollowing-v0", variant=variant, person_knows=knows)
+    rules = dataclasses.asdict(parameters_of(variant, person_knows=knows))
+    outcomes: dict[str, int] = {}
+    for player in ("random", "mixed", "adversarial"):
+        for outcome, count in compare_play(env, Reference(None, **rules), player, STEPS // 2, seed=5).items():
+            outcomes[outcome] = outcomes.get(outcome, 0) + count
+    assert outcomes["success"] > 0
+    assert (outcomes["steps of false belief"] > 0) == (variant == "false_belief")
 
 
 @pytest.mark.parametrize(("size", "crossings"), [(5, 1), (5, 2), (9, 0), (9, 1), (9, 2), (9, 6), (13, 3), (31, 9)])
