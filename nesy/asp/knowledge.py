@@ -269,8 +269,9 @@ class KnowledgeBase:
         else:
             text = (
                 f"{len(found.actions)} steps lead to [{goal}]: {', '.join(found.actions) or 'nothing to do'}\n"
-                f"  exactly these outcomes: probability {found.path_probability:.4f}; the goal holds at the end: "
-                f"{found.goal_probability:.4f} (a row lost at most {found.dropped:.2g})"
+                f"  exactly these outcomes: probability {found.path_probability:.3g}; the goal holds at the end: "
+                f"{found.goal_probability:.3g} "
+                + (f"(a row lost at most {found.dropped:.2g})" if found.exact else "(from 20,000 rollouts)")
             )
         return self._finding(f"How to reach [{goal}]?", text, [row], started)
 

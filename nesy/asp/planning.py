@@ -14,13 +14,15 @@ from nesy.asp.solver import solve
 from nesy.asp.sources import Source, read_sources
 from nesy.asp.verification import Literal, parse_literals
 from nesy.dbn.codebook import Codebook
-from nesy.dbn.inference import most_probable_next
+from nesy.dbn.inference import likely_next
 from nesy.dbn.model import TwoSliceDBN
 from nesy.dbn.plans import follow, pruned
 from nesy.dbn.rows import unique_rows
 from nesy.errors import UserError
 
 MAX_CODES = 20_000
+MAX_OUTCOMES = 50_000
+SAMPLES = 20_000
 
 
 @dataclass(frozen=True)
@@ -35,8 +37,10 @@ class Plan:
     """Probability of exactly these outcomes, from the model."""
     goal_probability: float
     """Probability that the goal holds at the end, whatever the outcomes on the way."""
+    exact: bool
+    """Whether `goal_probability` is computed; otherwise it is the share of 20,000 sampled rollouts."""
     dropped: float
-    """Values of a row below the least probability were left out for `goal_probability`: the most a row lost."""
+    """Values of a row below 0.001 were left out for an exact `goal_probability`: the most a row lost."""
     exhausted: bool
     """Without a plan: whether all plans up to the limit were searched (by most probable outcomes)."""
 
@@ -53,16 +57,23 @@ class PredicateTruth:
         # views that share a code may disagree: then neither holds
         self.holds, self.fails = hits == sizes, hits == 0
 
+    def knows(self, codes: np.ndarray) -> np.ndarray:
+        """Which codes some view met has: bool [n]."""
+        return self._places(codes) >= 0
+
     def of(self, codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where predicates hold and fail: two bool [n, P]; both false for a code that no view met has."""
-        both = np.concatenate([self.codes, np.asarray(codes, dtype=np.uint8)])
-        _, index, _ = unique_rows(both)
-        number = int(index.max(initial=-1)) + 1
-        place = np.full(number, -1)
-        place[index[: len(self.codes)]] = np.arange(len(self.codes))
-        found = place[index[len(self.codes) :]]
+        found = self._places(codes)
         known = (found >= 0)[:, None]
         return self.holds[found] & known, self.fails[found] & known
+
+    def _places(self, codes: np.ndarray) -> np.ndarray:
+        """Index of each code among `self.codes`, -1 where it is none of them."""
+        both = np.concatenate([self.codes, np.asarray(codes, dtype=np.uint8)])
+        _, index, _ = unique_rows(both)
+        place = np.full(int(index.max(initial=-1)) + 1, -1)
+        place[index[: len(self.codes)]] = np.arange(len(self.codes))
+        return np.asarray(place[index[len(self.codes) :]])
 
 
 def satisfied(literals: Sequence[Literal], codes: np.ndarray, truth: PredicateTruth | None) -> np.ndarray:
@@ -109,7 +120,7 @@ def find_plan(
     if not literals:
         raise UserError("a plan needs a goal")
     truth = PredicateTruth(codebook) if codebook is not None and len(codebook) else None
-    codes, successors, weights, distance = _reachable(dbn, start, max_steps)
+    codes, successors, weights, distance = _reachable(dbn, start, max_steps, truth)
     good = satisfied(literals, codes, truth)
     sources = read_sources(list(rules))
     first = int(distance[good].min(initial=max_steps + 1))
@@ -120,19 +131,22 @@ def find_plan(
         )
         if found is not None:
             actions, path = found
-            lost, goal_probability = _goal_probability(dbn, start, actions, literals, truth)
+            lost, goal_probability, exact = _goal_probability(dbn, start, actions, literals, truth)
             steps = zip(path, actions, strict=False)
             probability = math.prod(float(weights[c, a]) for c, a in steps)
             names = tuple(dbn.action_names[a] for a in actions)
             chain = tuple(tuple(int(v) for v in codes[c]) for c in path)
-            return Plan(names, chain, probability, goal_probability, lost, True)
-    return Plan(None, (), 0.0, 0.0, 0.0, True)
+            return Plan(names, chain, probability, goal_probability, exact, lost, True)
+    return Plan(None, (), 0.0, 0.0, True, 0.0, True)
 
 
 def _reachable(
-    dbn: TwoSliceDBN, start: np.ndarray, max_steps: int
+    dbn: TwoSliceDBN, start: np.ndarray, max_steps: int, truth: PredicateTruth | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Codes that most probable outcomes lead to within some steps.
+
+    Where it is known which codes were met, the most probable outcome is the most probable of those, and a code
+    that was not met is a dead end: its rows are guesses.
 
     Returns:
         uint8 [C, N] (the start first), successors int64 [C, A] (-1: not looked at), their probabilities, and the
@@ -144,7 +158,9 @@ def _reachable(
     weights = np.zeros((1, dbn.num_actions))
     edge = np.array([0])
     for step in range(1, max_steps + 1):
-        outcomes = [most_probable_next(dbn, codes[edge], a) for a in range(dbn.num_actions)]
+        if not len(edge):
+            break
+        outcomes = [_outcome(dbn, codes[edge], a, truth) for a in range(dbn.num_actions)]
         later = np.concatenate([code for code, _ in outcomes])
         first, index, _ = unique_rows(np.concatenate([codes, later]))
         # codes keep their numbers: `first` is the earliest occurrence only if it lies among them
@@ -158,14 +174,28 @@ def _reachable(
         weights[edge] = np.stack([weight for _, weight in outcomes], axis=1)
         if not len(new):
             break
-        edge = len(codes) + np.arange(len(new))
-        codes = np.concatenate([codes, later[example[new]]])
+        added = later[example[new]]
+        met = np.ones(len(new), dtype=bool) if truth is None else truth.knows(added)
+        edge = len(codes) + np.flatnonzero(met)
+        codes = np.concatenate([codes, added])
         if len(codes) > MAX_CODES:
             raise UserError(f"more than {MAX_CODES} codes can be reached in {step} steps; lower max_steps")
         distance = np.concatenate([distance, np.full(len(new), step)])
         successors = np.concatenate([successors, np.full((len(new), dbn.num_actions), -1)])
         weights = np.concatenate([weights, np.zeros((len(new), dbn.num_actions))])
     return codes, successors, weights, distance
+
+
+def _outcome(
+    dbn: TwoSliceDBN, codes: np.ndarray, action: int, truth: PredicateTruth | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The most probable next code, of those met where that is known and one of them is likely at all."""
+    later, weights = likely_next(dbn, codes, action)
+    choice = np.zeros(len(codes), dtype=np.int64)
+    if truth is not None:
+        choice = truth.knows(later.reshape(-1, later.shape[2])).reshape(weights.shape).argmax(axis=1)
+    number = np.arange(len(codes))
+    return later[number, choice], weights[number, choice]
 
 
 def _solve(
@@ -221,11 +251,18 @@ def _parse(atom: str) -> tuple[str, str, int]:
 
 def _goal_probability(
     dbn: TwoSliceDBN, start: np.ndarray, plan: list[int], literals: list[Literal], truth: PredicateTruth | None
-) -> tuple[float, float]:
-    """The mass dropped, and the probability of the goal after a plan."""
+) -> tuple[float, float, bool]:
+    """The mass dropped, the probability of the goal after a plan, and whether that is exact."""
     model, lost = pruned(dbn, LEAST)
-    codes, weights = follow(model, start, plan)
-    return lost, float(weights[satisfied(literals, codes, truth)].sum())
+    try:
+        codes, weights = follow(model, start, plan, most=MAX_OUTCOMES)
+    except UserError:
+        rng = np.random.default_rng(0)
+        drawn = np.tile(dbn._codes(start), (SAMPLES, 1))
+        for action in plan:
+            drawn = dbn.sample(drawn, action, rng)
+        return 0.0, float(satisfied(literals, drawn, truth).mean()), False
+    return lost, float(weights[satisfied(literals, codes, truth)].sum()), True
 
 
 @dataclass(frozen=True)

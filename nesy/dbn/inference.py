@@ -161,28 +161,48 @@ def joint_next(dbn: TwoSliceDBN, code: np.ndarray, action: int, drop: float = 0.
     return later[best_first].astype(np.uint8), weights[best_first]
 
 
-def most_probable_next(dbn: TwoSliceDBN, codes: np.ndarray, action: int) -> tuple[np.ndarray, np.ndarray]:
-    """The most probable next code of every code: each factor in `order` takes its most probable value.
+def likely_next(dbn: TwoSliceDBN, codes: np.ndarray, action: int, beam: int = 16) -> tuple[np.ndarray, np.ndarray]:
+    """The most probable next codes of every code, by beam search over the factors in `order`.
 
-    Exact where the factors are independent given slice t, or the chosen values are near certain; otherwise
-    a greedy choice (the probability returned is exact in any case).
+    Exact where a code has at most `beam` next codes, or the next factors are independent given slice t and
+    `beam` is 1; otherwise a candidate that is improbable for long may be lost (the probabilities are exact).
 
     Args:
         dbn: the model.
         codes: integers [B, N].
         action: the action.
+        beam: how many candidates are kept.
+
+    Returns:
+        uint8 [B, W, N] with W <= beam, most probable first, and their probabilities float64 [B, W].
+    """
+    now = dbn._codes(codes)
+    dbn._actions(action)
+    later = np.zeros((len(now), 1, dbn.num_factors), dtype=np.int64)
+    weights = np.ones((len(now), 1))
+    row_number = np.arange(len(now))[:, None]
+    for i in dbn.order:
+        before = np.broadcast_to(now[:, None], later.shape)
+        branches = (weights[:, :, None] * dbn.cpt(action, i)[dbn.rows(action, i, before, later)]).reshape(len(now), -1)
+        width = min(beam, branches.shape[1])
+        # stable, so that of equally probable candidates the one with smaller values comes first
+        best = np.argsort(-branches, axis=1, kind="stable")[:, :width]
+        later = later[row_number, best // dbn.num_values]
+        later[:, :, i] = best % dbn.num_values
+        weights = branches[row_number, best]
+    return later.astype(np.uint8), weights
+
+
+def most_probable_next(
+    dbn: TwoSliceDBN, codes: np.ndarray, action: int, beam: int = 16
+) -> tuple[np.ndarray, np.ndarray]:
+    """The most probable next code of every code (see `likely_next`).
 
     Returns:
         uint8 [B, N] and the probability of each, float64 [B].
     """
-    now = dbn._codes(codes)
-    later = np.zeros(now.shape, dtype=np.int64)
-    weights = np.ones(len(now))
-    for i in dbn.order:
-        rows = dbn.cpt(action, i)[dbn.rows(action, i, now, later)]
-        later[:, i] = rows.argmax(axis=1)
-        weights *= rows.max(axis=1)
-    return later.astype(np.uint8), weights
+    later, weights = likely_next(dbn, codes, action, beam)
+    return later[:, 0], weights[:, 0]
 
 
 def ancestors(dbn: TwoSliceDBN, action: int, factors: tuple[int, ...]) -> tuple[int, ...]:

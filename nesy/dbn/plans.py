@@ -31,7 +31,11 @@ def cone(dbn: TwoSliceDBN, plan: Sequence[int], factors: Sequence[int]) -> list[
 
 
 def follow(
-    dbn: TwoSliceDBN, code: np.ndarray, plan: Sequence[int], factors: Sequence[int] | None = None
+    dbn: TwoSliceDBN,
+    code: np.ndarray,
+    plan: Sequence[int],
+    factors: Sequence[int] | None = None,
+    most: int = MAX_CODES,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Exact distribution over the codes that a plan can lead to.
 
@@ -41,12 +45,13 @@ def follow(
         plan: the actions.
         factors: the factors asked for; only what they depend on is followed, other entries of the codes are 0.
             All by default.
+        most: most codes followed at once.
 
     Returns:
         uint8 [M, N], each once, and their probabilities float64 [M].
 
     Raises:
-        UserError: more than 2 million codes are reachable.
+        UserError: more than `most` codes are reachable.
     """
     needed = cone(dbn, plan, range(dbn.num_factors) if factors is None else factors)
     keep = np.zeros(dbn.num_factors, dtype=bool)
@@ -54,12 +59,12 @@ def follow(
     codes = np.where(keep, dbn._codes(code), 0)[None]
     weights = np.ones(1)
     for step, action in enumerate(plan):
-        codes, weights = _step(dbn, codes, weights, int(action), needed[step + 1])
+        codes, weights = _step(dbn, codes, weights, int(action), needed[step + 1], most)
     return codes.astype(np.uint8), weights
 
 
 def _step(
-    dbn: TwoSliceDBN, codes: np.ndarray, weights: np.ndarray, action: int, factors: tuple[int, ...]
+    dbn: TwoSliceDBN, codes: np.ndarray, weights: np.ndarray, action: int, factors: tuple[int, ...], most: int
 ) -> tuple[np.ndarray, np.ndarray]:
     now, later = codes, np.zeros_like(codes)
     # factors of slice t are dropped as soon as nobody asks for them any more, so that codes merge early
@@ -73,8 +78,8 @@ def _step(
         still = {p for j in waiting for p in dbn.parents_now[action][j]}
         now[:, [p for p in range(dbn.num_factors) if p not in still]] = 0
         now, later, weights = _merged(now, later, weights, dbn.num_values)
-        if len(weights) > MAX_CODES:
-            raise UserError("more than 2 million codes are reachable; prune the model or ask for fewer factors")
+        if len(weights) > most:
+            raise UserError(f"more than {most} codes are reachable; prune the model or ask for fewer factors")
     return later, weights
 
 

@@ -64,7 +64,8 @@ def _domain(dbn: TwoSliceDBN, codes: np.ndarray, goals: np.ndarray | None) -> st
     for a in range(dbn.num_actions):
         lines += [f"  (:action {identifier(dbn.action_names[a]).lower()}", "    :parameters ()"]
         lines += ["    :precondition ()", "    :effect (and"]
-        later, _ = most_probable_next(dbn, codes, a)
+        # factor by factor, so that a factor's outcome depends on its own context alone
+        later, _ = most_probable_next(dbn, codes, a, beam=1)
         for i in range(dbn.num_factors):
             scope = _scope(dbn, a, i)
             contexts, first = np.unique(codes[:, scope], axis=0, return_index=True)
