@@ -10,7 +10,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import clingo
 import numpy as np
@@ -21,6 +21,9 @@ from nesy.asp.sources import read_sources
 from nesy.dbn.codebook import Codebook
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
+
+if TYPE_CHECKING:
+    from nesy.asp.shield import Shield
 
 MOST_LINES = 8
 ENCODINGS = Path(__file__).with_name("encodings")
@@ -315,6 +318,25 @@ class KnowledgeBase:
                 lines.append(f"{name}: may be true, may be false")
         rows = [asdict(k) for k in found.values()]
         return self._finding("What is known, what is possible?", "\n".join(lines), rows, started)
+
+    def shield(self, rules: Sequence[str | Path], **options: Any) -> Shield:
+        """An action mask from people's rules (see nesy.asp.shield.Shield, which also lists the options).
+
+        Raises:
+            UserError: a rule is wrong, or the rules do not ground within their limits.
+        """
+        from nesy.asp.shield import Shield
+
+        book = self.codebook
+        return Shield(
+            rules,
+            self.dbn.action_names,
+            self.dbn.num_factors,
+            self.dbn.num_values,
+            () if book is None else book.predicate_names,
+            view_size=5 if book is None or not len(book) else book.views.shape[1],
+            **options,
+        )
 
     # ---------------------------------------------------------------- any program
     def query(

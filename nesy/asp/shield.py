@@ -1,0 +1,228 @@
+"""Shields: people's rules about actions as an action mask, grounded once and asked by assumptions.
+
+A rule file says `forbidden(forward) :- now(wall_ahead).` or `preferred(left) :- at(3,5).`; the situation (code,
+predicates of the view, person seen) is assumed for every decision, nothing is grounded again. Equal situations are
+answered from memory. A shield that would leave no action says which rules conflict, and falls back as configured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import clingo
+import numpy as np
+from clingo import ast
+
+from nesy.asp.facts import asp_name
+from nesy.asp.solver import solve
+from nesy.asp.sources import Source, read_sources
+from nesy.errors import UserError
+
+Fallback = Literal["all", "stay", "error"]
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What the rules say in one situation."""
+
+    allowed: tuple[bool, ...]
+    """Per action, after the fallback."""
+    preferred: tuple[bool, ...]
+    """Per action."""
+    because: dict[str, tuple[str, ...]]
+    """For each forbidden action the places (file:line:column) of the rules that forbid it."""
+    conflict: bool
+    """Whether the rules forbid every action, so that the fallback decided."""
+
+
+class Shield:
+    """An action mask from rule files."""
+
+    def __init__(
+        self,
+        rules: Sequence[str | Path],
+        action_names: Sequence[str],
+        num_factors: int,
+        num_values: int,
+        predicates: Sequence[str],
+        view_size: int = 5,
+        fallback: Fallback = "all",
+        stay: str = "stay",
+        time_limit: float = 10.0,
+        memory_mb: int = 1024,
+    ) -> None:
+        """Check the rules in a process of their own, then ground them once.
+
+        Args:
+            rules: rule files (`Path`) or texts (`str`).
+            action_names: A names.
+            num_factors: N.
+            num_values: K.
+            predicates: names of the view's predicates.
+            view_size: width of the view.
+            fallback: what is allowed where the rules forbid everything: `all` actions, only `stay`, or an `error`.
+            stay: name of the action that `stay` means.
+            time_limit: seconds that checking the rules may take.
+            memory_mb: memory that checking the rules may take.
+
+        Raises:
+            UserError: a rule is wrong, or the rules do not ground within their limits.
+        """
+        from nesy.asp.knowledge import ENCODINGS
+
+        self.action_names = tuple(action_names)
+        self._actions = tuple(asp_name(name) for name in action_names)
+        if fallback not in ("all", "stay", "error"):
+            raise UserError(f"no fallback '{fallback}'; the fallbacks are all, stay, error")
+        if fallback == "stay" and stay not in self.action_names:
+            raise UserError(f"the fallback 'stay' needs an action '{stay}'; the actions are {', '.join(action_names)}")
+        self.fallback, self._stay = fallback, stay
+        self.view_size = view_size
+        sources = read_sources(list(rules))
+        labelled = [Source(source.name, _labelled(source)) for source in sources]
+        words = " ".join(source.text for source in sources)
+        # only what some rule mentions can matter
+        self.predicates = tuple(name for name in predicates if asp_name(name) in words)
+        self._uses_code = "at(" in words.replace(" ", "")
+        situation = self._situation_program(num_factors, num_values)
+        encoding = Source("shield.lp", (ENCODINGS / "shield.lp").read_text(encoding="utf-8"))
+        solve([*sources, encoding], situation, (), time_limit=time_limit, memory_mb=memory_mb)
+        self._control = clingo.Control(["--warn=none", "--models=1"])
+        for source in (*labelled, encoding):
+            self._control.add("base", [], source.text)
+        self._control.add("base", [], situation)
+        self._control.ground([("base", [])])
+        self._inputs = [
+            (atom.literal, atom.symbol)
+            for name, arity in (("at", 2), ("now", 1), ("person", 3), ("unseen", 0))
+            for atom in self._control.symbolic_atoms.by_signature(name, arity)
+            if atom.is_external
+        ]
+        self._memory: dict[tuple[object, ...], Advice] = {}
+
+    def _situation_program(self, num_factors: int, num_values: int) -> str:
+        size = self.view_size
+        lines = [f"viewer({size // 2},{size - 1}).", "#external unseen."]
+        lines.append(f"#external person(X,Y,H) : X = 0..{size - 1}, Y = 0..{size - 1}, H = 0..3.")
+        lines += [f"#external now({asp_name(name)})." for name in self.predicates]
+        lines += [f"action({name})." for name in self._actions]
+        if self._uses_code:
+            lines.append(f"#external at(F,V) : F = 0..{num_factors - 1}, V = 0..{num_values - 1}.")
+        return "\n".join(lines)
+
+    def advise(self, code: np.ndarray, truth: np.ndarray, configuration: int) -> Advice:
+        """What the rules say in one situation.
+
+        Args:
+            code: integers [N].
+            truth: bool [P']: the predicates of `self.predicates` in the view.
+            configuration: where the person is seen: 0 unseen, else 1 + ((vx * size) + vy) * 4 + heading.
+
+        Raises:
+            UserError: the rules forbid every action and the fallback is `error`.
+        """
+        key = (bytes(np.asarray(code, dtype=np.uint8)) if self._uses_code else b"", bytes(truth), int(configuration))
+        if key not in self._memory:
+            self._memory[key] = self._ask(code, truth, int(configuration))
+        return self._memory[key]
+
+    def mask(self, codes: np.ndarray, truth: np.ndarray, configurations: np.ndarray) -> np.ndarray:
+        """Which actions are allowed in many situations.
+
+        Args:
+            codes: uint8 [B, N].
+            truth: bool [B, P']: the predicates of `self.predicates` in the views.
+            configurations: integers [B].
+
+        Returns:
+            bool [B, A], at least one true in every row.
+
+        Raises:
+            UserError: the shapes do not fit, or as `advise`.
+        """
+        if truth.shape != (len(codes), len(self.predicates)) or configurations.shape != (len(codes),):
+            raise UserError(
+                f"a shield with {len(self.predicates)} predicates needs truth [B, {len(self.predicates)}] and "
+                f"configurations [B], found {list(truth.shape)} and {list(configurations.shape)}"
+            )
+        rows = [self.advise(c, t, int(x)).allowed for c, t, x in zip(codes, truth, configurations, strict=True)]
+        return np.array(rows, dtype=bool).reshape(len(codes), len(self._actions))
+
+    def _ask(self, code: np.ndarray, truth: np.ndarray, configuration: int) -> Advice:
+        true = {clingo.Function("now", [clingo.Function(asp_name(self.predicates[p]))]) for p in np.flatnonzero(truth)}
+        if self._uses_code:
+            true |= {clingo.Function("at", [clingo.Number(f), clingo.Number(int(v))]) for f, v in enumerate(code)}
+        if configuration == 0:
+            true.add(clingo.Function("unseen"))
+        else:
+            cell, heading = divmod(configuration - 1, 4)
+            x, y = divmod(cell, self.view_size)
+            true.add(clingo.Function("person", [clingo.Number(x), clingo.Number(y), clingo.Number(heading)]))
+        # externals are free while assumptions fix every one of them
+        assumptions = [literal if symbol in true else -literal for literal, symbol in self._inputs]
+        for literal, _ in self._inputs:
+            self._control.assign_external(literal, None)
+        shown: list[clingo.Symbol] = []
+        result = self._control.solve(
+            assumptions=assumptions, on_model=lambda model: shown.extend(model.symbols(shown=True))
+        )
+        if not result.satisfiable:
+            raise UserError("the rules of the shield contradict each other in some situation (no model)")
+        return self._advice(shown)
+
+    def _advice(self, shown: Sequence[clingo.Symbol]) -> Advice:
+        said: dict[str, set[str]] = {"forbidden": set(), "preferred": set()}
+        places: dict[str, list[str]] = {}
+        for symbol in shown:
+            if symbol.name == "because":
+                action, place = symbol.arguments
+                places.setdefault(str(action), []).append(place.string)
+            else:
+                said[symbol.name].add(str(symbol.arguments[0]))
+        forbidden = said["forbidden"]
+        allowed = tuple(action not in forbidden for action in self._actions)
+        because = {
+            name: tuple(sorted(places.get(action, ())))
+            for name, action in zip(self.action_names, self._actions, strict=True)
+            if action in forbidden
+        }
+        conflict = not any(allowed)
+        if conflict:
+            if self.fallback == "error":
+                every = sorted({place for found in because.values() for place in found})
+                raise UserError(f"the shield leaves no action; these rules conflict: {', '.join(every)}")
+            allowed = tuple(self.fallback == "all" or name == self._stay for name in self.action_names)
+        preferred = tuple(action in said["preferred"] for action in self._actions)
+        return Advice(allowed, preferred, because, conflict)
+
+
+def _labelled(source: Source) -> str:
+    """The rules, and for each that forbids an action one that says where it stands."""
+    lines: list[str] = []
+
+    def add(statement: ast.AST) -> None:
+        lines.append(str(statement))
+        if statement.ast_type != ast.ASTType.Rule or statement.head.ast_type != ast.ASTType.Literal:
+            return
+        atom = statement.head.atom
+        if atom.ast_type != ast.ASTType.SymbolicAtom or statement.head.sign != ast.Sign.NoSign:
+            return
+        term = atom.symbol
+        if term.ast_type != ast.ASTType.Function or term.name != "forbidden" or len(term.arguments) != 1:
+            return
+        begin = statement.location.begin
+        place = f"{source.name}:{begin.line}:{begin.column}".replace("\\", "\\\\").replace('"', '\\"')
+        body = ", ".join(str(literal) for literal in statement.body)
+        reason = f'because({term.arguments[0]},"{place}")'
+        lines.append(f"{reason} :- {body}." if body else f"{reason}.")
+
+    messages: list[str] = []
+    try:
+        ast.parse_string(source.text, add, logger=lambda code, message: messages.append(message))
+    except RuntimeError as error:
+        text = " ".join("; ".join(messages).replace("<string>", source.name).split())
+        raise UserError(text or f"{source.name}: {error}") from None
+    return "\n".join(lines)

@@ -1,0 +1,125 @@
+"""Shields: masks, reasons, conflicts, and how fast they answer."""
+
+import time
+
+import numpy as np
+import pytest
+
+from nesy.asp import KnowledgeBase
+from nesy.asp.shield import Shield
+from nesy.errors import UserError
+from tests.nesy.dbn.toy import toy
+
+ACTIONS = ("left", "right", "forward", "stay")
+RULES = """
+% never walk into a wall or the person
+forbidden(forward) :- now(wall_ahead).
+forbidden(forward) :- now(person_ahead).
+preferred(stay) :- person(_,_,_), not now(person_ahead).
+forbidden(left) :- at(3,5), unseen.
+"""
+
+
+def make(rules=RULES, **options):
+    return Shield([rules], ACTIONS, 8, 8, ("wall_ahead", "goal_visible"), **options)
+
+
+def configuration(x, y, heading):
+    return 1 + (x * 5 + y) * 4 + heading
+
+
+CODE = np.zeros(8, dtype=np.uint8)
+
+
+def test_rules_become_a_mask_with_reasons():
+    shield = make()
+    assert shield.predicates == ("wall_ahead",)
+    advice = shield.advise(CODE, np.array([True]), 0)
+    assert advice.allowed == (True, True, False, True)
+    assert advice.because == {"forward": ("program:3:1",)}
+    assert shield.advise(CODE, np.array([False]), 0).allowed == (True,) * 4
+    ahead = shield.advise(CODE, np.array([False]), configuration(2, 3, 1))
+    assert ahead.allowed == (True, True, False, True) and ahead.because["forward"] == ("program:4:1",)
+    assert ahead.preferred == (False,) * 4
+    aside = shield.advise(CODE, np.array([False]), configuration(1, 3, 1))
+    assert aside.allowed == (True,) * 4 and aside.preferred == (False, False, False, True)
+    code = CODE.copy()
+    code[3] = 5
+    assert shield.advise(code, np.array([False]), 0).allowed == (False, True, True, True)
+    both = shield.advise(code, np.array([True]), configuration(2, 3, 0))
+    assert both.because == {"forward": ("program:3:1", "program:4:1")}
+
+
+def test_masks_are_those_of_single_questions_in_any_order():
+    shield, other = make(), make()
+    rng = np.random.default_rng(0)
+    codes = rng.integers(0, 8, size=(50, 8)).astype(np.uint8)
+    truth = rng.random((50, 1)) < 0.5
+    places = rng.integers(0, 101, size=50)
+    masks = shield.mask(codes, truth, places)
+    for b in rng.permutation(50):
+        assert tuple(masks[b]) == other.advise(codes[b], truth[b], int(places[b])).allowed
+        wall, person = truth[b, 0], places[b] != 0 and (places[b] - 1) // 4 == 2 * 5 + 3
+        assert masks[b, 2] == (not wall and not person)
+
+
+def test_a_conflict_names_its_rules_and_falls_back():
+    rules = "forbidden(A) :- action(A), now(wall_ahead).\nforbidden(stay) :- now(goal_visible)."
+    truth = np.array([True, True])
+    advice = make(rules).advise(CODE, truth, 0)
+    assert advice.conflict and advice.allowed == (True,) * 4
+    assert advice.because["stay"] == ("program:1:1", "program:2:1")
+    assert make(rules, fallback="stay").advise(CODE, truth, 0).allowed == (False, False, False, True)
+    with pytest.raises(UserError, match=r"program:1:1, program:2:1"):
+        make(rules, fallback="error").advise(CODE, truth, 0)
+
+
+def test_rules_that_contradict_each_other_are_an_error():
+    with pytest.raises(UserError, match="contradict"):
+        make(":- now(wall_ahead).").advise(CODE, np.array([True]), 0)
+
+
+@pytest.mark.parametrize(
+    ("rules", "message"),
+    [
+        ("forbidden(forward) :- now(wall_ahead)", "2:1"),
+        ("#script (python) #end.", "script"),
+        ("forbidden(A) :- not now(wall_ahead).", "unsafe"),
+        ("n(0). n(X+1) :- n(X). forbidden(stay) :- n(-1).", "not grounded"),
+    ],
+)
+def test_wrong_and_hostile_rules_are_refused_before_they_are_grounded_here(rules, message):
+    with pytest.raises(UserError, match=message):
+        make(rules, time_limit=1.0, memory_mb=512)
+
+
+def test_wrong_settings_are_explained():
+    with pytest.raises(UserError, match="fallback"):
+        make(fallback="none")
+    with pytest.raises(UserError, match="stay"):
+        make(fallback="stay", stay="wait")
+    with pytest.raises(UserError, match="truth"):
+        make().mask(np.zeros((2, 8), dtype=np.uint8), np.zeros((2, 3), dtype=bool), np.zeros(2, dtype=int))
+
+
+def test_a_decision_takes_at_most_two_milliseconds():
+    shield = make()
+    rng = np.random.default_rng(0)
+    times = []
+    for _ in range(200):
+        code, truth = rng.integers(0, 8, size=8).astype(np.uint8), rng.random(1) < 0.5
+        started = time.perf_counter()
+        shield.advise(code, truth, int(rng.integers(101)))
+        times.append(time.perf_counter() - started)
+    assert np.median(times) < 2e-3
+
+
+def test_the_knowledge_base_makes_shields():
+    base = KnowledgeBase(*toy())
+    shield = base.shield(["forbidden(go) :- now(wall_ahead)."], fallback="all")
+    assert shield.mask(
+        np.array([[1, 0, 0], [0, 0, 0]], dtype=np.uint8), np.array([[True], [False]]), np.zeros(2, int)
+    ).tolist() == [
+        [True, False],
+        [True, True],
+    ]
