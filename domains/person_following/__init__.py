@@ -1,17 +1,21 @@
 """Person following in crossing maps: the task, its variants, experts, oracles and metrics."""
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from domains.person_following.speed import benchmark as benchmark
     from domains.person_following.domain import DOMAIN as DOMAIN
 
-__all__ = ["DOMAIN"]
+__all__ = ["DOMAIN", "benchmark"]
+
+_PLACES = {"DOMAIN": "domain", "benchmark": "speed"}
 
 
 def __getattr__(name: str) -> Any:
     # Compiled kernels load slowly, so they load when first asked for.
-    if name == "DOMAIN":
-        from domains.person_following.domain import DOMAIN
-
-        return DOMAIN
+    if name in _PLACES:
+        value = getattr(importlib.import_module(f"domains.person_following.{_PLACES[name]}"), name)
+        globals()[name] = value
+        return value
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,112 @@
+"""Speed of the environments: steps per second by size and batch, beside Minigrid in the same run.
+
+Everything a learner pays for is included: views, configurations, rewards, infos, automatic resets to fresh
+maps, and for greedy play the expert's actions.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from domains.person_following.domain import DOMAIN
+
+_CROSSINGS = {5: 1, 7: 1, 9: 1, 11: 2, 13: 3, 19: 5, 25: 7, 31: 9}
+
+
+@dataclass(frozen=True)
+class SpeedRow:
+    """One measurement; `minigrid_ratio` is against Minigrid's SimpleCrossingS9N1 in the same run."""
+
+    what: str
+    size: int
+    num_crossings: int
+    batch: int
+    player: str
+    steps_per_second: float
+    minigrid_ratio: float
+
+
+def benchmark(
+    variant: str = "paper",
+    sizes: Sequence[int] = (9, 13, 19, 31),
+    batches: Sequence[int] = (1, 16, 128, 1024, 4096, 16384),
+    seconds: float = 1.0,
+    seed: int = 0,
+) -> list[dict[str, Any]]:
+    """Rows of `SpeedRow` as dicts: Minigrid first, then the single environment, then every size and batch.
+
+    Args:
+        variant: whose rules to play.
+        sizes: map sizes; all batches are measured at size 9, and 1024 at the others.
+        batches: numbers of environments.
+        seconds: how long to step for each row, after a warm-up.
+        seed: of maps and random actions.
+    """
+    base = _minigrid(seconds, seed)
+    rows = [SpeedRow("minigrid SimpleCrossingS9N1", 9, 1, 1, "random", base, 1.0)]
+    single = _single(variant, seconds, seed)
+    rows.append(SpeedRow("single environment", 9, 1, 1, "random", single, single / base))
+    for size in sizes:
+        crossings = _CROSSINGS.get(size, max(1, size // 4))
+        for batch in batches:
+            if size != sizes[0] and batch not in (1024, max(batches)):
+                continue
+            for player in ("random", "greedy"):
+                rate = _batched(variant, size, crossings, batch, player, seconds, seed)
+                rows.append(SpeedRow("batch", size, crossings, batch, player, rate, rate / base))
+    return [asdict(row) for row in rows]
+
+
+def _minigrid(seconds: float, seed: int) -> float:
+    import minigrid  # noqa: F401  registers its environments
+
+    env = gymnasium.make("MiniGrid-SimpleCrossingS9N1-v0")
+    return _rate_of_single(env, 3, seconds, seed)
+
+
+def _single(variant: str, seconds: float, seed: int) -> float:
+    env = gymnasium.make("nesy/PersonFollowing-v0", variant=variant, size=9, num_crossings=1)
+    return _rate_of_single(env, 4, seconds, seed)
+
+
+def _rate_of_single(env: gymnasium.Env[Any, Any], num_actions: int, seconds: float, seed: int) -> float:
+    actions = np.random.default_rng(seed).integers(0, num_actions, 4096).tolist()
+    env.reset(seed=seed)
+    steps, limit = 0, 0.0
+    started = time.perf_counter()
+    while steps <= 64 or time.perf_counter() < limit:
+        if steps == 64:
+            started = time.perf_counter()
+            limit = started + seconds
+        _, _, terminated, truncated, _ = env.step(actions[steps % 4096])
+        if terminated or truncated:
+            env.reset()
+        steps += 1
+    return (steps - 64) / (time.perf_counter() - started)
+
+
+def _batched(variant: str, size: int, crossings: int, batch: int, player: str, seconds: float, seed: int) -> float:
+    env = DOMAIN.make("following", batch, variant, seed=seed, size=size, num_crossings=crossings)
+    env.reset()
+    rng = np.random.default_rng(seed)
+    actions = rng.integers(0, 4, (64, batch))
+    steps, rounds = 0, 0
+    started, limit = time.perf_counter(), 0.0
+    while rounds <= 8 or time.perf_counter() < limit:
+        if rounds == 8:
+            steps, started = 0, time.perf_counter()
+            limit = started + seconds
+        chosen = env.expert_actions("follower") if player == "greedy" else actions[rounds % 64]
+        env.step(chosen)
+        rounds += 1
+        steps += batch
+    return steps / (time.perf_counter() - started)
+
+
+__all__ = ["SpeedRow", "benchmark"]
