@@ -4,26 +4,33 @@
 shows, and rolls the belief through the learned forward model action by action. What is believed at the end is
 b~_a, the belief of an agent that stands there (arXiv 2503.20425, section 3).
 
+The planner `network` does just that with factored beliefs, as published. The planner `table` keeps the joint
+distribution over codes and remembers what the own view has shown: after every step a code loses weight for every
+cell that its decoded view has otherwise than the own view had it.
+
 A belief that is certain of a code is shifted once per (code, configuration) and remembered.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from domains.core import UNSEEN, WALL, ViewGeometry
-from nesy.compiled import njit
+from domains.core import UNSEEN, ViewGeometry
 from nesy.errors import UserError
+from nesy.world_model.codec import code_keys
 from nesy.world_model.rolling import Rollout
 from nesy.world_model.successors import Factored, PackedModel, pack
+from nesy.world_model.walks import plan_all, poses_along, remember_all
 
 INFLUENCE_MODES = ("zero", "random", "egocentric", "perspective-shift", "perfect-information")
 PLANNERS = ("table", "network")
-LEFT, RIGHT, FORWARD = 0, 1, 2
-UP = 3  # the viewer's own heading in view coordinates
-_DX, _DY = (1, 0, -1, 0), (0, 1, 0, -1)
+FORGET = 0.01
+"""Weight that a code keeps for every cell in which it contradicts what was seen."""
+BLOCK = 2048
+"""Walks rolled at once, to bound the memory that their sparse distributions take."""
 
 
 class ShiftModel(Protocol):
@@ -111,11 +118,13 @@ class Shift(NamedTuple):
         beliefs: float32 [B, N, K], b~; uniform where the other agent is unseen or out of reach.
         reachable: bool [B].
         num_actions: int64 [B], imagined actions; 0 where not reachable.
+        codes: uint8 [B, N], the most probable code of b~ (0 where not reachable).
     """
 
     beliefs: np.ndarray
     reachable: np.ndarray
     num_actions: np.ndarray
+    codes: np.ndarray
 
 
 class ImaginedPath(NamedTuple):
@@ -134,79 +143,6 @@ class ImaginedPath(NamedTuple):
     reachable: bool
 
 
-@njit(cache=True)
-def plan_path(view: np.ndarray, vx: int, vy: int, heading: int, path: np.ndarray) -> int:
-    """A shortest way from the viewer's pose to a pose in its view; walls and unseen cells block.
-
-    Uniform-cost search over (x, y, heading), actions tried in the order left, right, forward.
-
-    Args:
-        view: uint8 [v, v], indexed [vx, vy].
-        vx: column of the pose.
-        vy: row of the pose.
-        heading: of the pose; the viewer's own is 3.
-        path: int64 [at least 4 * v * v], gets the actions.
-
-    Returns:
-        The number of actions, or -1 if the pose cannot be reached.
-    """
-    width = view.shape[0]
-    total = width * width * 4
-    parent = np.full(total, -1, dtype=np.int64)
-    action_to = np.zeros(total, dtype=np.int64)
-    queue = np.zeros(total, dtype=np.int64)
-    start = ((width // 2) * width + width - 1) * 4 + 3
-    goal = (vx * width + vy) * 4 + heading
-    parent[start] = start
-    queue[0] = start
-    head, tail = 0, 1
-    while head < tail and parent[goal] < 0:
-        pose = queue[head]
-        head += 1
-        h = pose % 4
-        y = pose // 4 % width
-        x = pose // 4 // width
-        for action in range(3):
-            nx, ny, nh = x, y, h
-            if action == 0:
-                nh = (h + 3) % 4
-            elif action == 1:
-                nh = (h + 1) % 4
-            else:
-                nx = x + (1 if h == 0 else -1 if h == 2 else 0)
-                ny = y + (1 if h == 1 else -1 if h == 3 else 0)
-                if nx < 0 or nx >= width or ny < 0 or ny >= width:
-                    continue
-                if view[nx, ny] == WALL or view[nx, ny] == UNSEEN:
-                    continue
-            then = (nx * width + ny) * 4 + nh
-            if parent[then] < 0:
-                parent[then] = pose
-                action_to[then] = action
-                queue[tail] = then
-                tail += 1
-    if parent[goal] < 0:
-        return -1
-    length = 0
-    pose = goal
-    while pose != start:
-        path[length] = action_to[pose]
-        length += 1
-        pose = parent[pose]
-    for i in range(length // 2):
-        path[i], path[length - 1 - i] = path[length - 1 - i], path[i]
-    return length
-
-
-@njit(cache=True)
-def _plan_all(views: np.ndarray, vx: np.ndarray, vy: np.ndarray, heading: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    paths = np.zeros((len(views), 4 * views.shape[1] * views.shape[2]), dtype=np.int64)
-    lengths = np.zeros(len(views), dtype=np.int64)
-    for i in range(len(views)):
-        lengths[i] = plan_path(views[i], vx[i], vy[i], heading[i], paths[i])
-    return paths, lengths
-
-
 class PerspectiveShift:
     """Φ over one model, with its memory."""
 
@@ -215,8 +151,8 @@ class PerspectiveShift:
 
         Args:
             model: codec or table model.
-            planner: `table` rolls the joint distribution over codes through the 2DBN's tables; `network` rolls
-                the factored belief through the model's `predict`, as published.
+            planner: `table` rolls the joint distribution over codes through the 2DBN's tables and remembers what
+                was seen; `network` rolls the factored belief through the model's `predict`, as published.
 
         Raises:
             UserError: an unknown planner, or `table` for a model that has no tables.
@@ -229,8 +165,7 @@ class PerspectiveShift:
         self.model = model
         self._rollout = None if packed is None else Rollout(packed)
         self._keys = np.zeros(0, dtype=np.int64)
-        self._beliefs = np.zeros((0, model.num_factors, model.num_values), dtype=np.float32)
-        self._lengths = np.zeros(0, dtype=np.int64)
+        self._memory = _Walked.nowhere(0, model.num_factors, model.num_values)
 
     def __call__(self, beliefs: np.ndarray, configurations: np.ndarray) -> Shift:
         """Shift beliefs [B, N, K] to configurations [B]."""
@@ -240,82 +175,139 @@ class PerspectiveShift:
         assert beliefs.shape == (len(configurations), num_factors, num_values), beliefs.shape
         codes = beliefs.argmax(-1).astype(np.uint8)
         certain = (beliefs.max(-1) == 1.0).all(-1)
-        result = np.full_like(beliefs, 1.0 / num_values)
-        lengths = np.full(len(beliefs), -1, dtype=np.int64)
-        seen = configurations > 0
-        rows = np.flatnonzero(seen & certain)
+        result = _Walked.nowhere(len(beliefs), num_factors, num_values)
+        rows = np.flatnonzero((configurations > 0) & certain)
         if len(rows):
             index = self._remembered(codes[rows], configurations[rows])
-            lengths[rows] = self._lengths[index]
-            result[rows] = self._beliefs[index]
-        rows = np.flatnonzero(seen & ~certain)
+            result.put(rows, self._memory.take(index))
+        rows = np.flatnonzero((configurations > 0) & ~certain)
         if len(rows):
-            result[rows], lengths[rows] = self._roll(beliefs[rows], codes[rows], configurations[rows])
-        return Shift(result, lengths >= 0, np.maximum(lengths, 0))
+            result.put(rows, self._walk(beliefs[rows], codes[rows], configurations[rows]))
+        return Shift(result.beliefs, result.lengths >= 0, np.maximum(result.lengths, 0), result.codes)
+
+    def imagine(self, belief: np.ndarray, configuration: int) -> ImaginedPath:
+        """One walk with every belief on the way; `belief` [N, K]."""
+        belief = np.asarray(belief, dtype=np.float32)
+        nowhere = ImaginedPath((), np.full((1, *belief.shape), 1.0 / self.model.num_values, np.float32), (), False)
+        if configuration <= 0:
+            return nowhere
+        views = self.model.views(belief.argmax(-1).astype(np.uint8)[None])
+        paths, lengths = plan_all(views, *self._targets(views, np.array([configuration])))
+        if lengths[0] < 0:
+            return nowhere
+        beliefs = [belief]
+        if lengths[0] > 0:
+            self._roll(belief[None], views, paths, lengths, beliefs)
+        actions = tuple(int(action) for action in paths[0, : lengths[0]])
+        return ImaginedPath(actions, np.stack(beliefs), poses_along(actions, views.shape[1]), True)
+
+    @staticmethod
+    def _targets(views: np.ndarray, configurations: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return ViewGeometry(views.shape[1]).decode(configurations)
 
     def _remembered(self, codes: np.ndarray, configurations: np.ndarray) -> np.ndarray:
         """Index into the memory of each (code, configuration), which is filled where it has to be."""
-        keys = np.zeros(len(codes), dtype=np.int64)
-        for factor in range(codes.shape[1]):
-            keys = keys * self.model.num_values + codes[:, factor]
-        keys = keys << 16 | configurations
+        keys = code_keys(codes, self.model.num_values) << 16 | configurations
         index = np.minimum(np.searchsorted(self._keys, keys), max(len(self._keys) - 1, 0))
         known = self._keys[index] == keys if len(self._keys) else np.zeros(len(keys), dtype=bool)
         if not known.all():
             new, first = np.unique(keys[~known], return_index=True)
             codes, configurations = codes[~known][first], configurations[~known][first]
-            certain = np.eye(self.model.num_values, dtype=np.float32)[codes]
-            beliefs, lengths = self._roll(certain, codes, configurations)
-            merged = np.concatenate([self._keys, new])
-            order = np.argsort(merged)
-            self._keys = merged[order]
-            self._beliefs = np.concatenate([self._beliefs, beliefs])[order]
-            self._lengths = np.concatenate([self._lengths, lengths])[order]
+            walked = self._walk(np.eye(self.model.num_values, dtype=np.float32)[codes], codes, configurations)
+            order = np.argsort(np.concatenate([self._keys, new]))
+            self._keys = np.concatenate([self._keys, new])[order]
+            self._memory = self._memory.joined(walked).take(order)
             index = np.searchsorted(self._keys, keys)
         return index
 
-    def _roll(
-        self, beliefs: np.ndarray, codes: np.ndarray, configurations: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Shifted beliefs and path lengths (-1: unreachable), nothing remembered."""
+    def _walk(self, beliefs: np.ndarray, codes: np.ndarray, configurations: np.ndarray) -> _Walked:
+        """Walk to configurations, all of them seen; nothing is looked up."""
         views = self.model.views(codes)
-        vx, vy, heading = ViewGeometry(views.shape[1]).decode(configurations)
-        paths, lengths = _plan_all(views, vx, vy, heading)
-        result = np.full_like(beliefs, 1.0 / self.model.num_values)
-        result[lengths == 0] = beliefs[lengths == 0]
+        paths, lengths = plan_all(views, *self._targets(views, configurations))
+        result = _Walked.nowhere(len(beliefs), self.model.num_factors, self.model.num_values)
+        result.lengths[:] = lengths
+        here = np.flatnonzero(lengths == 0)
+        result.put(here, _Walked(beliefs[here], lengths[here], codes[here]))
         # Longest first, so that the walks still under way are always the first ones.
-        order = np.argsort(-lengths, kind="stable")
-        order = order[: int((lengths > 0).sum())]
-        if len(order):
-            roll = self._roll_network if self._rollout is None else self._roll_tables
-            result[order] = roll(beliefs[order], paths[order], lengths[order])
-        return result, lengths
-
-    def _roll_network(self, beliefs: np.ndarray, paths: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-        beliefs = beliefs.copy()
-        for step in range(int(lengths[0])):
-            active = int((lengths > step).sum())
-            beliefs[:active] = self.model.predict(beliefs[:active], paths[:active, step])
-        return beliefs
-
-    def _roll_tables(self, beliefs: np.ndarray, paths: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-        assert self._rollout is not None
-        result = np.empty_like(beliefs)
-        block = 2048  # walks at once, to bound the memory of the sparse distributions
-        for first in range(0, len(beliefs), block):
-            rows = slice(first, min(first + block, len(beliefs)))
-            start, code, mass = self._rollout.spread(beliefs[rows].astype(np.float64))
-            active = lengths[rows]
-            for step in range(int(active[0])):
-                going = int((active > step).sum())
-                # Starts ascend, so the entries of walks that have arrived are the last ones.
-                cut = int(np.searchsorted(start, going))
-                moved = self._rollout.step(start[:cut], code[:cut], mass[:cut], paths[rows][start[:cut], step])
-                start, code, mass = (
-                    np.concatenate([new, old[cut:]]) for new, old in zip(moved, (start, code, mass), strict=True)
-                )
-            result[rows] = self._rollout.marginals(start, code, mass, len(active))
+        order = np.argsort(-lengths, kind="stable")[: int((lengths > 0).sum())]
+        for first in range(0, len(order), BLOCK):
+            rows = order[first : first + BLOCK]
+            shifted, likeliest = self._roll(beliefs[rows], views[rows], paths[rows], lengths[rows])
+            result.put(rows, _Walked(shifted, lengths[rows], likeliest))
         return result
+
+    def _roll(
+        self,
+        beliefs: np.ndarray,
+        views: np.ndarray,
+        paths: np.ndarray,
+        lengths: np.ndarray,
+        trace: list[np.ndarray] | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Beliefs and likeliest codes at the ends of walks, longest walk first; `trace` gets those of the first."""
+        if self._rollout is None:
+            beliefs = beliefs.copy()
+            for step in range(int(lengths[0])):
+                going = int((lengths > step).sum())
+                beliefs[:going] = self.model.predict(beliefs[:going], paths[:going, step])
+                if trace is not None:
+                    trace.append(beliefs[0].copy())
+            return beliefs, beliefs.argmax(-1).astype(np.uint8)
+        rollout = self._rollout
+        memory = remember_all(views, paths, lengths)
+        start, code, mass = rollout.spread(beliefs.astype(np.float64))
+        for step in range(int(lengths[0])):
+            going = int((lengths > step).sum())
+            # Starts ascend, so the entries of walks that have arrived are the last ones.
+            cut = int(np.searchsorted(start, going))
+            moved = rollout.step(start[:cut], code[:cut], mass[:cut], paths[start[:cut], step])
+            moved = self._reminded(rollout, *moved, memory[:going, step])
+            rest = (start[cut:], code[cut:], mass[cut:])
+            start, code, mass = (np.concatenate([new, old]) for new, old in zip(moved, rest, strict=True))
+            if trace is not None:
+                trace.append(rollout.marginals(start, code, mass, len(beliefs))[0])
+        best = np.lexsort((-mass, start))[np.searchsorted(start, np.arange(len(beliefs)))]
+        return rollout.marginals(start, code, mass, len(beliefs)), rollout.codes(code[best])
+
+    def _reminded(
+        self, rollout: Rollout, start: np.ndarray, code: np.ndarray, mass: np.ndarray, memory: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Weigh the codes of walks by how well their views agree with what was seen, `memory` [walks, v, v]."""
+        distinct, place = np.unique(code, return_inverse=True)
+        meant = self.model.views(rollout.codes(distinct)).reshape(len(distinct), -1)
+        seen = memory.reshape(len(memory), -1)[start]
+        wrong = ((meant[place] != seen) & (seen != UNSEEN)).sum(1)
+        least = np.full(len(memory), seen.shape[1])
+        np.minimum.at(least, start, wrong)
+        weighed = mass * FORGET ** (wrong - least[start]).astype(np.float64)
+        return rollout.pruned(start, code, weighed)
+
+
+@dataclass
+class _Walked:
+    """Results of walks: beliefs [n, N, K], path lengths [n] (-1: no way) and likeliest codes [n, N]."""
+
+    beliefs: np.ndarray
+    lengths: np.ndarray
+    codes: np.ndarray
+
+    @classmethod
+    def nowhere(cls, size: int, num_factors: int, num_values: int) -> _Walked:
+        uniform = np.full((size, num_factors, num_values), 1.0 / num_values, dtype=np.float32)
+        return cls(uniform, np.full(size, -1, dtype=np.int64), np.zeros((size, num_factors), dtype=np.uint8))
+
+    def put(self, rows: np.ndarray, other: _Walked) -> None:
+        self.beliefs[rows], self.lengths[rows], self.codes[rows] = other.beliefs, other.lengths, other.codes
+
+    def take(self, rows: np.ndarray) -> _Walked:
+        return _Walked(self.beliefs[rows], self.lengths[rows], self.codes[rows])
+
+    def joined(self, other: _Walked) -> _Walked:
+        return _Walked(
+            np.concatenate([self.beliefs, other.beliefs]),
+            np.concatenate([self.lengths, other.lengths]),
+            np.concatenate([self.codes, other.codes]),
+        )
 
 
 def shift(beliefs: np.ndarray, configurations: np.ndarray, model: ShiftModel, *, planner: str = "table") -> Shift:
@@ -339,42 +331,10 @@ def imagine(belief: np.ndarray, configuration: int, model: ShiftModel, *, planne
         model: codec or table model.
         planner: as in `shift`; by default `table` where the model has tables.
     """
-    belief = np.asarray(belief, dtype=np.float32)
-    assert belief.shape == (model.num_factors, model.num_values), belief.shape
-    packed = model.packed()
-    nowhere = ImaginedPath((), np.full((1, *belief.shape), 1.0 / model.num_values, np.float32), (), False)
-    if configuration <= 0:
-        return nowhere
-    view = model.views(belief.argmax(-1).astype(np.uint8)[None])[0]
-    vx, vy, heading = (int(part) for part in ViewGeometry(len(view)).decode(configuration))
-    path = np.zeros(4 * view.size, dtype=np.int64)
-    length = plan_path(view, vx, vy, heading, path)
-    if length < 0:
-        return nowhere
-    actions = tuple(int(action) for action in path[:length])
-    beliefs = [belief]
-    if packed is None or planner == "network":
-        for action in actions:
-            beliefs.append(model.predict(beliefs[-1][None], np.array([action]))[0])
-    else:
-        rollout = Rollout(packed)
-        start, code, mass = rollout.spread(belief[None].astype(np.float64))
-        for action in actions:
-            start, code, mass = rollout.step(start, code, mass, np.full(len(start), action))
-            beliefs.append(rollout.marginals(start, code, mass, 1)[0])
-    return ImaginedPath(actions, np.stack(beliefs), _poses(actions, len(view)), True)
-
-
-def _poses(actions: tuple[int, ...], width: int) -> tuple[tuple[int, int, int], ...]:
-    x, y, heading = width // 2, width - 1, UP
-    poses = [(x, y, heading)]
-    for action in actions:
-        if action == FORWARD:
-            x, y = x + _DX[heading], y + _DY[heading]
-        else:
-            heading = (heading + (3 if action == LEFT else 1)) % 4
-        poses.append((x, y, heading))
-    return tuple(poses)
+    assert np.shape(belief) == (model.num_factors, model.num_values), np.shape(belief)
+    if planner is None:
+        planner = "network" if model.packed() is None else "table"
+    return PerspectiveShift(model, planner).imagine(belief, int(configuration))
 
 
 class InfluenceBelief:

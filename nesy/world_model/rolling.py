@@ -56,15 +56,18 @@ class Rollout:
         size = self.model.num_values**self.model.num_factors
         combined, place = np.unique(start[entry] * size + self._codes[successor], return_inverse=True)
         joint = np.bincount(place, mass[entry] * self._mass[successor], minlength=len(combined))
-        return self._pruned(combined // size, combined % size, joint)
+        return self.pruned(combined // size, combined % size, joint)
 
-    def _pruned(
+    def pruned(
         self, start: np.ndarray, code: np.ndarray, mass: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        kept = mass > self.threshold
+        """Distributions without their least probable entries, rescaled to mass 1; each keeps its likeliest one."""
+        total = np.bincount(start, mass)
+        peak = np.zeros(len(total))
+        np.maximum.at(peak, start, mass)
+        kept = (mass > self.threshold * total[start]) | (mass == peak[start])
         start, code, mass = start[kept], code[kept], mass[kept]
-        total = np.bincount(start, mass) if len(start) else np.zeros(0)
-        return start, code, mass / total[start]
+        return start, code, mass / np.bincount(start, mass)[start]
 
     def _lookup(self, wanted: np.ndarray) -> np.ndarray:
         distinct = np.unique(wanted)
@@ -92,7 +95,7 @@ class Rollout:
             code = (code[:, None] * self.model.num_values + values).reshape(-1)
             kept = joint > self.threshold
             start, code, mass = np.repeat(start, len(values))[kept], code[kept], joint[kept]
-        return self._pruned(start, code, mass)
+        return self.pruned(start, code, mass)
 
     def marginals(self, start: np.ndarray, code: np.ndarray, mass: np.ndarray, size: int) -> np.ndarray:
         """Factored marginals float32 [size, N, K] of sparse distributions."""

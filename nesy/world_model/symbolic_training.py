@@ -43,6 +43,8 @@ RELUCTANCE = 1.5
 """Nats of cost per nat of the encoder's disbelief."""
 NOISE = 12.0
 """Annealing temperature of the refinement at its start, in nats."""
+FIT_EPOCHS = 60
+"""Epochs that the third stage may take at least."""
 SWEEPS = 2
 """Passes over the code book per round of refinement."""
 
@@ -114,7 +116,11 @@ class SymbolicTrainer:
     # ---------------------------------------------------------------- progress and time
     def length(self) -> int:
         """Most ticks that the run can take."""
-        return self.config.epochs * 2 + self.rounds
+        return self.config.epochs + self.rounds + self._fit_epochs()
+
+    def _fit_epochs(self) -> int:
+        # A refined code book is learned from scratch, which takes its time however little there was before.
+        return max(self.config.epochs, FIT_EPOCHS) if self.refines else self.config.epochs
 
     def deadline(self) -> float:
         """Seconds of the time limit after which the present stage must end."""
@@ -128,7 +134,7 @@ class SymbolicTrainer:
         stage = self.stage
         figures = {"network": self._network_epoch, "codes": self._codes_round, "fit": self._fit_epoch}[stage]()
         self.epoch += 1
-        last = {"network": self.config.epochs, "codes": self.rounds, "fit": self.config.epochs}[stage]
+        last = {"network": self.config.epochs, "codes": self.rounds, "fit": self._fit_epochs()}[stage]
         if self.epoch >= last or figures.pop("converged", False) or elapsed >= self.deadline():
             self._end_stage()
         return {"stage": stage, **figures}
@@ -213,7 +219,7 @@ class SymbolicTrainer:
 
     # ---------------------------------------------------------------- stage 3
     def _fit_epoch(self) -> dict[str, Any]:
-        done = self.epoch / self.config.epochs
+        done = self.epoch / self._fit_epochs()
         if self.book is None:
             return {**self._autoencoder_epoch(0.0, 0.4, done), **self._view_figures()}
         self._set_learning_rate(done)
