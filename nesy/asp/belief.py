@@ -13,6 +13,7 @@ from typing import Any
 import clingo
 import numpy as np
 
+from nesy.asp.encoding import ENCODINGS
 from nesy.asp.facts import asp_name
 from nesy.asp.planning import PredicateTruth
 from nesy.dbn.rows import unique_rows
@@ -53,8 +54,6 @@ class BeliefQuestions:
         Raises:
             UserError: no particles, or no such predicate.
         """
-        from nesy.asp.knowledge import ENCODINGS
-
         particles = np.asarray(particles, dtype=np.uint8)
         if particles.ndim != 2 or not len(particles):
             raise UserError("a question about a belief needs at least one particle")

@@ -12,10 +12,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import clingo
 import numpy as np
 
 from nesy.asp.facts import Facts, asp_name
+from nesy.asp.meaning import MOST_LINES, changes_of, meaning_of, values_that_imply
 from nesy.asp.solver import Answer, solve
 from nesy.asp.sources import read_sources
 from nesy.dbn.codebook import Codebook
@@ -24,9 +24,6 @@ from nesy.errors import UserError
 
 if TYPE_CHECKING:
     from nesy.asp.shield import Shield
-
-MOST_LINES = 8
-ENCODINGS = Path(__file__).with_name("encodings")
 
 
 @dataclass(frozen=True)
@@ -93,28 +90,8 @@ class KnowledgeBase:
         f = self.factor(factor)
         if not 0 <= value < self.dbn.num_values:
             raise UserError(f"no value {value}; the values of a factor are 0 to {self.dbn.num_values - 1}")
-        book = self._book()
-        facts = self.facts.text(("predicate",)) + "\n".join(self.facts.cooccurs(factors=(f,)))
-        totals = "".join(
-            f"seen_of({name},{count},{len(book)})."
-            for name, count in zip(self.facts.predicates, book.predicates.sum(axis=0).tolist(), strict=True)
-        )
-        atoms = run_encoding(("meaning",), f"asked({f},{value}). least({_percent(least)}). {totals} {facts}")
-        rows: list[dict[str, Any]] = [
-            {
-                "relation": atom.name,
-                "predicate": self._predicate_name(atom.arguments[0].name),
-                "views": atom.arguments[1].number,
-                "of": atom.arguments[2].number,
-                "of_all_views": self._share(atom.arguments[0].name),
-            }
-            for atom in atoms
-            if atom.arguments
-        ]
-        order = {"means": 0, "excludes": 1, "mixed": 2}
-        rows.sort(key=lambda r: (order[r["relation"]], -abs(r["views"] / r["of"] - r["of_all_views"]), r["predicate"]))
-        name = f"{self.dbn.factor_names[f]} = {value}"
-        return self._finding(f"What does {name} mean?", self._meaning_text(name, rows), rows, started)
+        text, rows = meaning_of(self.facts, self._book(), f, value, least)
+        return self._finding(f"What does {self.dbn.factor_names[f]} = {value} mean?", text, rows, started)
 
     def influenced(self, action: int | str) -> Finding:
         """Which factors does action A change, and through which parents?
@@ -124,37 +101,8 @@ class KnowledgeBase:
         """
         started = time.perf_counter()
         a = self.action(action)
-        facts = self.facts.text(("taken", "changed", "parent"))
-        atoms = run_encoding(("influence",), f"asked({self.facts.actions[a]}). {facts}")
-        parents: dict[int, list[str]] = {i: [] for i in range(self.dbn.num_factors)}
-        changes = dict.fromkeys(range(self.dbn.num_factors), (0, 0))
-        for atom in atoms:
-            numbers = [argument.number for argument in atom.arguments[1:]]
-            if atom.name == "through":
-                parents[numbers[0]].append(self.dbn.factor_names[numbers[1]] + ("'" if numbers[2] else ""))
-            elif atom.name == "changes":
-                changes[numbers[0]] = (numbers[1], numbers[2])
-        rows: list[dict[str, Any]] = [
-            {
-                "factor": self.dbn.factor_names[i],
-                "changed": changes[i][0],
-                "of": changes[i][1],
-                "parents": sorted(parents[i]),
-            }
-            for i in sorted(changes, key=lambda i: (-changes[i][0], i))
-        ]
-        name = self.dbn.action_names[a]
-        moved = [r for r in rows if r["changed"]]
-        lines = [f"'{name}' changes {len(moved)} of {len(rows)} factors:"]
-        lines += [
-            f"  {r['factor']}  in {_percentage(r['changed'], r['of'])} of {r['of']} transitions, "
-            f"decided by {', '.join(r['parents']) or 'nothing'}"
-            for r in moved
-        ]
-        kept = [r["factor"] for r in rows if not r["changed"]]
-        if kept:
-            lines.append(f"  never changed: {', '.join(kept)}")
-        return self._finding(f"Which factors does '{name}' change?", "\n".join(lines), rows, started)
+        text, rows = changes_of(self.facts, a)
+        return self._finding(f"Which factors does '{self.dbn.action_names[a]}' change?", text, rows, started)
 
     def implies(self, predicate: str, least: float = 0.95) -> Finding:
         """Which values, alone or two together, mean that a predicate holds?
@@ -167,28 +115,7 @@ class KnowledgeBase:
             UserError: no such predicate.
         """
         started = time.perf_counter()
-        book = self._book()
-        truth = book.predicate(predicate)
-        name = asp_name(predicate)
-        facts = "\n".join([*self.facts.cooccurs(predicates=(name,)), *self.facts.together(predicates=(name,))])
-        atoms = run_encoding(("implies",), f"asked({name}). least({_percent(least)}). {facts}")
-        rows = []
-        for atom in atoms:
-            numbers = [argument.number for argument in atom.arguments]
-            values = list(zip(numbers[:-2:2], numbers[1:-2:2], strict=True))
-            covered = _having(book, values) & truth
-            rows.append(
-                {
-                    "values": [{"factor": self.dbn.factor_names[f], "value": v} for f, v in values],
-                    "views": numbers[-2],
-                    "of": numbers[-1],
-                    "covers": round(float(covered.sum() / max(1, truth.sum())), 4),
-                    "_covered": covered,
-                }
-            )
-        rows.sort(key=lambda r: (len(r["values"]), -r["covers"], str(r["values"])))
-        chosen, rows = _greedy_cover(rows)
-        text = self._implies_text(predicate, chosen, len(rows), int(truth.sum()), len(book))
+        text, rows = values_that_imply(self.facts, self._book(), predicate, least)
         return self._finding(f"Which values mean that {predicate} holds?", text, rows, started)
 
     # ---------------------------------------------------------------- steps, plans, beliefs
@@ -408,108 +335,5 @@ class KnowledgeBase:
             raise UserError("this model has no codebook: its values have no meaning in views")
         return self.codebook
 
-    def _predicate_name(self, constant: str) -> str:
-        return self._book().predicate_names[self.facts.predicates.index(constant)]
-
-    def _share(self, constant: str) -> float:
-        return round(float(self._book().predicates[:, self.facts.predicates.index(constant)].mean()), 4)
-
     def _finding(self, question: str, text: str, rows: Sequence[dict[str, Any]], started: float) -> Finding:
         return Finding(question, text, tuple(rows), round(time.perf_counter() - started, 4))
-
-    def _meaning_text(self, name: str, rows: Sequence[dict[str, Any]]) -> str:
-        if not rows:
-            return f"{name}: no view met in experience has this value."
-        lines = [f"{name} ({rows[0]['of']} of {len(self._book())} distinct views):"]
-        words = {"means": "holds", "excludes": "does not hold"}
-        for relation in words:
-            chosen = [row for row in rows if row["relation"] == relation]
-            for row in chosen[:MOST_LINES]:
-                share = _percentage(row["views"], row["of"])
-                lines.append(
-                    f"  {row['predicate']} {words[relation]}: true in {share} of them, "
-                    f"in {100 * row['of_all_views']:.1f} % of all views"
-                )
-            if len(chosen) > MOST_LINES:
-                lines.append(f"  ... and {len(chosen) - MOST_LINES} predicates more that {words[relation]}")
-        mixed = [r for r in rows if r["relation"] == "mixed"][:3]
-        if len(lines) == 1:
-            lines.append("  no predicate is decided by this value alone; the nearest:")
-            lines += [
-                f"  {r['predicate']}: true in {_percentage(r['views'], r['of'])} of them, "
-                f"in {100 * r['of_all_views']:.1f} % of all views"
-                for r in mixed
-            ]
-        return "\n".join(lines)
-
-    def _implies_text(
-        self, predicate: str, chosen: Sequence[dict[str, Any]], total: int, positive: int, views: int
-    ) -> str:
-        head = f"{predicate} holds in {positive} of {views} distinct views."
-        if not chosen:
-            return f"{head}\n  No value and no pair of values implies it."
-        lines = [head, f"  {total} values or pairs imply it; these cover what can be covered:"]
-        for row in chosen:
-            values = " and ".join(f"{v['factor']} = {v['value']}" for v in row["values"])
-            lines.append(
-                f"  {values}: true in {row['views']} of {row['of']} views, covers {100 * row['covers']:.1f} % "
-                f"of the views with {predicate} (so far {100 * row['covered_so_far']:.1f} %)"
-            )
-        return "\n".join(lines)
-
-
-def run_encoding(names: Sequence[str], facts: str, optimise: bool = False) -> list[clingo.Symbol]:
-    """The shown atoms of our own encodings on some facts; they are known to end, so no limits are needed.
-
-    Args:
-        names: the encodings.
-        facts: program text.
-        optimise: whether to look for the best model; otherwise the first will do.
-    """
-    options = ["--opt-mode=opt", "--models=0"] if optimise else ["--opt-mode=ignore", "--models=1"]
-    control = clingo.Control(["--warn=none", *options])
-    for name in names:
-        control.load(str(ENCODINGS / f"{name}.lp"))
-    control.add("base", [], facts)
-    control.ground([("base", [])])
-    atoms: list[clingo.Symbol] = []
-    with control.solve(yield_=True) as handle:
-        for model in handle:
-            atoms = list(model.symbols(shown=True))
-    return sorted(atoms)
-
-
-def _having(book: Codebook, values: Sequence[tuple[int, int]]) -> Any:
-    """Which views have all the values (factor, value): bool [V]."""
-    chosen = book.counts >= 0
-    for factor, value in values:
-        chosen = chosen & (book.codes[:, factor] == value)
-    return chosen
-
-
-def _greedy_cover(rows: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """A small choice of rows that together cover all that any row covers; and the rows as plain data."""
-    masks = [row.pop("_covered") for row in rows]
-    if not rows:
-        return [], []
-    covered = masks[0] & False
-    total = max(1.0, *(mask.sum() / max(row["covers"], 1e-9) for mask, row in zip(masks, rows, strict=True)))
-    chosen: list[dict[str, Any]] = []
-    while True:
-        gains = [int((mask & ~covered).sum()) for mask in masks]
-        best = max(range(len(rows)), key=lambda j: (gains[j], -len(rows[j]["values"]), -j))
-        if not gains[best]:
-            return chosen, rows
-        covered = covered | masks[best]
-        rows[best]["covered_so_far"] = round(float(covered.sum() / total), 4)
-        chosen.append(rows[best])
-
-
-def _percent(share: float) -> int:
-    if not 0.5 < share <= 1:
-        raise UserError(f"the least share must lie between 0.5 and 1, found {share}")
-    return round(100 * share)
-
-
-def _percentage(part: int, whole: int) -> str:
-    return f"{100 * part / max(1, whole):.1f} %"

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nesy.asp.encoding import ENCODINGS, run_encoding
 from nesy.asp.facts import LEAST, Facts, asp_name
 from nesy.asp.solver import solve
 from nesy.asp.sources import Source, read_sources
@@ -211,8 +212,6 @@ def _solve(
     truth: PredicateTruth | None,
     time_limit: float,
 ) -> tuple[list[int], list[int]] | None:
-    from nesy.asp.knowledge import ENCODINGS, run_encoding
-
     facts = Facts(dbn, None)
     lines = [f"horizon({horizon}).", "start(0)."] + [f"goal({c})." for c in np.flatnonzero(good).tolist()]
     for c, a in zip(*(index.tolist() for index in np.nonzero(successors >= 0)), strict=True):

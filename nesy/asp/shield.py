@@ -16,6 +16,7 @@ import clingo
 import numpy as np
 from clingo import ast
 
+from nesy.asp.encoding import ENCODINGS
 from nesy.asp.facts import asp_name
 from nesy.asp.solver import solve
 from nesy.asp.sources import Source, read_sources
@@ -71,8 +72,6 @@ class Shield:
         Raises:
             UserError: a rule is wrong, or the rules do not ground within their limits.
         """
-        from nesy.asp.knowledge import ENCODINGS
-
         self.action_names = tuple(action_names)
         self._actions = tuple(asp_name(name) for name in action_names)
         if fallback not in ("all", "stay", "error"):

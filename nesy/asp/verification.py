@@ -15,6 +15,7 @@ import clingo
 import numpy as np
 
 from nesy.asp.diagrams import diagram, diagram_facts
+from nesy.asp.encoding import ENCODINGS
 from nesy.asp.facts import LEAST, asp_name
 from nesy.asp.semantics import RuleSet, asp_rules, predicate_rules
 from nesy.dbn.codebook import Codebook
@@ -181,8 +182,6 @@ def _rows_of(dbn: TwoSliceDBN, action: int, factor: int, known: np.ndarray) -> n
 
 
 def _solve(facts: str, num_factors: int) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
-    from nesy.asp.knowledge import ENCODINGS
-
     control = clingo.Control(["--warn=none"])
     control.load(str(ENCODINGS / "transition.lp"))
     control.load(str(ENCODINGS / "verify.lp"))

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nesy.dbn import storage
+from nesy.dbn.rows import distinct_rows, expanded_rows, scattered_counts
 from nesy.errors import UserError
 
 if TYPE_CHECKING:
@@ -357,8 +358,8 @@ class TwoSliceDBN:
                 parents_now=_parents(document["parents_now"]),
                 parents_next=_parents(document["parents_next"]),
                 order=tuple(int(i) for i in document["order"]),
-                probabilities=_expanded(arrays["distinct_rows"], arrays["row_index"]),
-                row_counts=_scattered(arrays["met_rows"], arrays["met_counts"], len(arrays["row_index"])),
+                probabilities=expanded_rows(arrays["distinct_rows"], arrays["row_index"]),
+                row_counts=scattered_counts(arrays["met_rows"], arrays["met_counts"], len(arrays["row_index"])),
                 initial=arrays["initial"],
                 value_meanings=tuple(_strings(texts) for texts in document["value_meanings"]),
                 provenance=dict(document["provenance"]),
@@ -411,37 +412,3 @@ def _strings(value: Any) -> tuple[str, ...]:
 
 def _parents(value: Any) -> Parents:
     return tuple(tuple(tuple(int(p) for p in ps) for ps in per_action) for per_action in value)
-
-
-def distinct_rows(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The distinct rows of a table, and which one every row is: most rows of a large table are never met.
-
-    Args:
-        table: float64 [R, K].
-
-    Returns:
-        float64 [U, K] and uint32 [R].
-    """
-    bits = np.ascontiguousarray(table).view(np.uint64)
-    odd = np.random.default_rng(0).integers(1 << 62, size=bits.shape[1], dtype=np.uint64) * np.uint64(2) + np.uint64(1)
-    mixed = bits ^ (bits >> np.uint64(29))
-    _, first, index = np.unique((mixed * odd).sum(axis=1, dtype=np.uint64), return_index=True, return_inverse=True)
-    index = index.reshape(-1).astype(np.uint32)
-    if not np.array_equal(bits[first][index], bits):  # two rows with one hash
-        distinct, exact = np.unique(bits, axis=0, return_inverse=True)
-        return distinct.view(np.float64), exact.reshape(-1).astype(np.uint32)
-    return table[first], index
-
-
-def _expanded(distinct: np.ndarray, index: np.ndarray) -> np.ndarray:
-    if distinct.ndim != 2 or distinct.dtype != np.float64 or index.ndim != 1 or index.dtype != np.uint32:
-        raise ValueError("the rows are not float64 [U, K] with an index uint32 [R]")
-    return distinct[index]
-
-
-def _scattered(rows: np.ndarray, counts: np.ndarray, number: int) -> np.ndarray:
-    if rows.dtype != np.int64 or counts.dtype != np.int64 or rows.shape != counts.shape or (rows < 0).any():
-        raise ValueError("the counts are not int64 numbers for rows")
-    result = np.zeros(number, dtype=np.int64)
-    result[rows] = counts
-    return result
