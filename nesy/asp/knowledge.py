@@ -23,6 +23,7 @@ from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
 
 if TYPE_CHECKING:
+    from nesy.asp.constraints import Removal
     from nesy.asp.shield import Shield
 
 
@@ -264,6 +265,27 @@ class KnowledgeBase:
             view_size=5 if book is None or not len(book) else book.views.shape[1],
             **options,
         )
+
+    def constrained(
+        self, rules: Sequence[str | Path], time_limit: float = 10.0, memory_mb: int = 2048
+    ) -> tuple[TwoSliceDBN, Removal]:
+        """The model without the entries that rules call impossible, and what was removed.
+
+        Args:
+            rules: programs that derive impossible(A,F,X,V) for entries as in row(A,F,X,V,W).
+            time_limit: seconds for grounding and solving.
+            memory_mb: memory for grounding and solving.
+
+        Raises:
+            UserError: wrong rules, rules that contradict each other, or a row that would be left empty.
+        """
+        from nesy.asp.constraints import remove_entries
+
+        show = "#show impossible/4. #defined impossible/4."
+        answer = self.query(show, rules, time_limit=time_limit, memory_mb=memory_mb)
+        if not answer.models:
+            raise UserError("the rules contradict each other: they have no model")
+        return remove_entries(self.dbn, answer.models[0])
 
     # ---------------------------------------------------------------- any program
     def query(

@@ -1,0 +1,107 @@
+"""docs/asp.md: every question in it is asked, every program run, on a model of the real domain."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nesy.asp import VOCABULARY, KnowledgeBase
+from nesy.dbn.codebook import Codebook, value_meanings
+from nesy.dbn.extraction import Transitions
+from nesy.dbn.fitting import from_experience
+from nesy.dbn.structure import Search
+from nesy.errors import UserError
+from tests.nesy.dbn.toy import toy
+
+TEXT = (Path(__file__).resolve().parents[3] / "docs" / "asp.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"```(python|lp)\n(.*?)```", TEXT, re.DOTALL)
+# two cells per factor: the kind of the first, and whether the second is a wall
+CELLS = [(2, 3, 1, 4), (2, 2, 3, 4), (1, 3, 3, 3), (2, 1, 1, 2), (3, 2, 0, 4), (4, 4, 0, 3), (4, 3, 2, 0), (1, 1, 3, 1)]
+
+
+def encode(views):
+    return np.stack([views[:, a, b] % 3 * 2 + (views[:, c, d] == 1) for a, b, c, d in CELLS], axis=1).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def base():
+    from domains.core import load_domain
+
+    domain = load_domain("person_following")
+    environment = domain.make("crossing", 64, seed=0)
+    rng = np.random.default_rng(0)
+    observation, _ = environment.reset(seed=0)
+    before, actions, after = [], [], []
+    for _ in range(60):
+        action = rng.integers(0, 4, size=64)
+        later, _, terminated, truncated, _ = environment.step(action)
+        going = ~(terminated | truncated)
+        before.append(observation["view"][going].copy())
+        actions.append(action[going])
+        after.append(later["view"][going].copy())
+        observation = later
+    taken = Transitions(np.concatenate(before), np.concatenate(actions), np.concatenate(after), encode)
+    codebook = Codebook.build(taken.views, taken.view_codes, taken.view_counts, domain.predicates)
+    dbn = from_experience(
+        taken.codes,
+        taken.actions,
+        taken.next_codes,
+        num_values=8,
+        search=Search(max_parents=2, exhaustive=1),
+        prior_count=0.01,
+        action_names=domain.spec.action_names,
+        meanings=value_meanings(codebook, 8),
+    )
+    return KnowledgeBase(dbn, codebook)
+
+
+def test_the_ten_questions_and_everything_else_in_python(base, capsys, monkeypatch):
+    names = {"base": base}
+    monkeypatch.setattr(KnowledgeBase, "from_run", classmethod(lambda cls, path: base))
+    for language, block in BLOCKS:
+        if language == "python":
+            exec(compile(block, "docs/asp.md", "exec"), names)  # our own documentation, not a stranger's
+    assert sum(block.count("print(") for language, block in BLOCKS if language == "python") >= 10
+    text = capsys.readouterr().out
+    assert "wall_ahead holds in" in text and "'forward' changes" in text
+    assert len(re.findall(r"^\*\*\d+\. ", TEXT, re.MULTILINE)) == 10
+
+
+@pytest.mark.parametrize("number", range(sum(language == "lp" for language, _ in BLOCKS)))
+def test_programs(base, number):
+    program = [block for language, block in BLOCKS if language == "lp"][number]
+    answer = base.query(program)
+    assert answer.satisfiable and answer.models[0]
+    assert not answer.notes
+
+
+def test_the_vocabulary_is_complete():
+    for fact, meaning in VOCABULARY.items():
+        assert f"| `{fact}` | {meaning} |" in TEXT
+
+
+def test_a_wall_ahead_is_recovered_from_the_codes(base):
+    finding = base.rules("wall_ahead", held_out=0.25)
+    assert finding.rows[0]["accuracy"] == finding.rows[0]["precision"] == finding.rows[0]["recall"] == 1
+    assert "X0 in {2, 3}" in finding.text
+
+
+def test_impossible_entries_are_removed_and_reported():
+    base = KnowledgeBase(*toy())
+    rules = "impossible(swap,0,(1,),2). impossible(go,1,X,0) :- row(go,1,X,0,W), X = (1,0)."
+    with pytest.raises(UserError, match="row side = 1, front = 0 of side under go"):
+        base.constrained([rules])
+    model, report = base.constrained(["impossible(swap,0,(1,),2)."])
+    assert (report.entries, report.rows, report.largest) == (1, 1, 0.0)
+    np.testing.assert_array_equal(model.probabilities, base.dbn.probabilities)
+    for wrong in ("impossible(fly,0,(1,),2).", "impossible(swap,0,(1,1),2).", "impossible(swap,0,(1,),9)."):
+        with pytest.raises(UserError, match="impossible"):
+            base.constrained([wrong])
+
+
+def test_rows_are_renormalised_when_entries_go(base):
+    model, report = base.constrained(["impossible(A,F,X,V) :- row(A,F,X,V,W), W < 300000."])
+    assert report.entries > 0 and 0 < report.largest < 0.9 and 0 < report.visits <= 1
+    np.testing.assert_allclose(model.probabilities.sum(axis=1), 1)
+    assert ((base.dbn.probabilities > 0) & (model.probabilities == 0)).sum() == report.entries
