@@ -126,7 +126,7 @@ def _sweep(
     visit: np.ndarray,
     noise: np.ndarray,
     reluctance: np.ndarray,
-    taken: set[int],
+    taken: np.ndarray,
     codes: np.ndarray,
     source: np.ndarray,
     action: np.ndarray,
@@ -162,7 +162,7 @@ def _sweep(
         _shift_counts(-1, *common)
         best, best_cost = old, np.inf
         for value in range(num_values):
-            if value != old and (rest + value * place) in taken:
+            if value != old and taken[rest + value * place]:
                 continue
             codes[view, i] = value
             cost = _shift_counts(1, *common) + reluctance[view, i, value] - noise[step, value]
@@ -173,8 +173,8 @@ def _sweep(
         _shift_counts(1, *common)
         if best != old:
             moved += 1
-            taken.remove(whole)
-            taken.add(rest + best * place)
+            taken[whole] = False
+            taken[rest + best * place] = True
     return moved
 
 
@@ -248,7 +248,8 @@ class Refiner:
             gumbel = noise * rng.gumbel(size=(len(visit), self.num_values)) if noise > 0 else np.zeros((1, 1))
             if noise <= 0:
                 gumbel = np.broadcast_to(gumbel, (len(visit), self.num_values)).copy()
-            taken = {int(code) for code in codes @ place}
+            taken = np.zeros(self.num_values**num_factors, dtype=np.bool_)
+            taken[codes @ place] = True
             moved += _sweep(
                 visit, gumbel, reluctance, taken, codes, *edges, self._start, self._incident,
                 count, which, factor, as_now, as_next, self.num_values, cells, rows, self._table,

@@ -188,7 +188,7 @@ def successors(
         model: the packed forward model.
         codes: int [S, N].
         actions: int [S].
-        threshold: in (0, 1); an expansion ends where a branch becomes less probable than this.
+        threshold: in [0, 1); an expansion ends where a branch becomes less probable than this.
 
     Returns:
         `ends` int64 [S + 1], successor codes uint8 [T, N] and their probabilities float64 [T]; those of entry s

@@ -1,0 +1,169 @@
+"""Training as a product: same seed, same weights; resume is exact; damage is told in one line."""
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from nesy.config import TrainConfig
+from nesy.errors import UserError
+from nesy.progress import SilentProgress, Task
+from nesy.world_model import SymbolicCodec, load_world_model, save_world_model, train
+from nesy.world_model.storage import load_tensors
+from tests.nesy.conftest import SMALL, toy_experience
+
+
+class Killed(Exception):
+    """Stands for the signal."""
+
+
+class KilledAfter(SilentProgress):
+    """Raises when the training reports its n-th epoch."""
+
+    def __init__(self, epochs: int) -> None:
+        self.left = epochs
+
+    def task(self, description: str, total: int):  # type: ignore[no-untyped-def]
+        outer = self
+
+        class Bar:
+            def __enter__(self) -> Task:
+                return self
+
+            def __exit__(self, *_: object) -> None:
+                return None
+
+            def advance(self, steps: int = 1, **metrics: float) -> None:
+                if metrics:
+                    outer.left -= 1
+                    if outer.left == 0:
+                        raise Killed
+
+        return Bar()
+
+
+def weights(folder: Path) -> dict[str, torch.Tensor]:
+    return load_tensors(folder / "model.safetensors")[0]
+
+
+@pytest.mark.parametrize("architecture", ["symbolic", "paper"])
+def test_resume_gives_the_same_weights_bit_for_bit(
+    architecture: str, tmp_path: Path, trained: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("nesy.world_model.paper_training.STEPS", 8)
+    config = SMALL if architecture == "symbolic" else TrainConfig(architecture="paper", epochs=3, batch_size=16)
+    experience = toy_experience()
+    whole = trained
+    if architecture == "paper":
+        whole = tmp_path / "whole"
+        train(experience, config, whole, seed=1)
+    folder = tmp_path / "cut"
+    moments = (1, 2) if architecture == "paper" else (1, 3, 5, 1, 2, 2, 6)
+    for epochs in moments:
+        with pytest.raises(Killed):
+            train(experience, config, folder, seed=1, progress=KilledAfter(epochs))
+        assert not (folder / "model.safetensors").exists()
+    train(experience, config, folder, seed=1)
+    expected, got = weights(whole), weights(folder)
+    assert expected.keys() == got.keys()
+    for name, tensor in expected.items():
+        assert torch.equal(tensor, got[name]), name
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    assert [line["tick"] for line in lines] == list(range(1, len(lines) + 1))
+    reference = [json.loads(line) for line in (whole / "metrics.jsonl").read_text().splitlines()]
+    for line, other in zip(lines, reference, strict=True):
+        assert {**line, "seconds": 0} == {**other, "seconds": 0}
+
+
+def test_killed_by_the_signal_and_resumed(tmp_path: Path, trained: Path) -> None:
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[2]); from pathlib import Path\n"
+        "from tests.nesy.conftest import SMALL, toy_experience\n"
+        "from nesy.world_model import train\n"
+        "train(toy_experience(), SMALL, Path(sys.argv[1]), seed=1)\n"
+    )
+    folder = tmp_path / "killed"
+    root = str(Path(__file__).parents[3])
+    process = subprocess.Popen([sys.executable, "-c", code, str(folder), root], cwd=root)
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and process.poll() is None:
+        log = folder / "metrics.jsonl"
+        if log.exists() and len(log.read_text().splitlines()) >= 4:
+            break
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    train(toy_experience(), SMALL, folder, seed=1)
+    expected, got = weights(trained), weights(folder)
+    assert all(torch.equal(expected[name], got[name]) for name in expected)
+
+
+def test_another_seed_or_setting_starts_anew(tmp_path: Path, toy, trained: Path) -> None:  # type: ignore[no-untyped-def]
+    folder = tmp_path / "model"
+    config = TrainConfig(epochs=2, batch_size=64, time_limit=0.0, held_out=0.0)
+    first = train(toy, config, folder, seed=1)
+    before = weights(folder)
+    assert train(toy, config, folder, seed=1)["epochs"] == first["epochs"]
+    train(toy, config, folder, seed=2)
+    assert not all(torch.equal(before[name], weights(folder)[name]) for name in before if "0.weight" in name)
+
+
+def test_held_out_figures_are_of_maps_not_learned_from(trained: Path) -> None:
+    metrics = json.loads((trained / "config.json").read_text())["metrics"]
+    held_out = metrics["held_out"]
+    assert 0 < held_out["distinct_views"] < metrics["distinct_views"]
+    assert np.isfinite(held_out["next_code_nll"])
+    assert held_out["next_code_nll"] >= held_out["limits"]["next_code_nll"] - 1e-9
+
+
+def test_save_and_load_keep_everything(tmp_path: Path, trained: Path, toy) -> None:  # type: ignore[no-untyped-def]
+    model = load_world_model(trained)
+    save_world_model(model, tmp_path, {"note": 1})
+    again = load_world_model(tmp_path)
+    views = toy.view[:50]
+    a, b = SymbolicCodec(model), SymbolicCodec(again)
+    np.testing.assert_array_equal(a.codes(views), b.codes(views))
+    beliefs, actions = a.beliefs(views), toy.action[:50]
+    np.testing.assert_array_equal(a.predict(beliefs, actions), b.predict(beliefs, actions))
+    np.testing.assert_array_equal(a.views(a.codes(views)), views)
+
+
+def test_damage_is_told_in_one_line(tmp_path: Path, trained: Path) -> None:
+    for name in ("config.json", "model.safetensors"):
+        (tmp_path / name).write_bytes((trained / name).read_bytes())
+    weights_file, config_file = tmp_path / "model.safetensors", tmp_path / "config.json"
+    whole, config = weights_file.read_bytes(), config_file.read_text()
+    for damaged in (b"", whole[:100], whole[: len(whole) // 2], b"\xff" * 200):
+        weights_file.write_bytes(damaged)
+        with pytest.raises(UserError, match=r"model\.safetensors: damaged"):
+            load_world_model(tmp_path)
+    weights_file.unlink()
+    with pytest.raises(UserError, match="no such file"):
+        load_world_model(tmp_path)
+    weights_file.write_bytes(whole)
+    for text in ("{", "[]", config.replace('"hidden": 256', '"hidden": 128')):
+        config_file.write_text(text)
+        with pytest.raises(UserError):
+            load_world_model(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"epochs": 0}, "epochs"),
+        ({"max_parents": 9}, "max_parents"),
+        ({"held_out": 1.0}, "held_out"),
+        ({"device": "nowhere"}, "--device"),
+        ({"architecture": "other"}, "unknown architecture"),
+    ],
+)
+def test_impossible_settings(settings: dict[str, object], message: str, tmp_path: Path, toy) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(UserError, match=message):
+        train(toy, TrainConfig(**settings), tmp_path)  # type: ignore[arg-type]
+    with pytest.raises(UserError, match="no experience"):
+        train(toy.select(np.zeros(len(toy), bool)), SMALL, tmp_path)
