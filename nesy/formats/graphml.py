@@ -14,4 +14,4 @@ from nesy.run_folder import atomic_path
 def write(dbn: TwoSliceDBN, path: Path) -> None:
     """Write the graph as GraphML; edges carry `action` and `strength`."""
     with atomic_path(path) as temporary:
-        networkx.write(to_networkx(dbn), temporary)
+        networkx.write_graphml(to_networkx(dbn), temporary)

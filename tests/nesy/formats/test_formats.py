@@ -102,3 +102,85 @@ def test_parquet_of_something_else_and_in_another_order_is_refused(tmp_path):
     pq.write_table(table.take(list(range(table.num_rows))[::-1]), path)
     with pytest.raises(UserError, match=r"order|distribution"):
         formats.read(path)
+
+
+def test_graphs_have_every_arc(tmp_path):
+    import networkx
+
+    dbn = random_dbn(np.random.default_rng(2))
+    formats.export(dbn, tmp_path / "m.graphml")
+    graph = networkx.read_graphml(tmp_path / "m.graphml")
+    arcs = sum(len(dbn.parents(a, i)) for a in range(2) for i in range(3))
+    assert graph.number_of_nodes() == 6 and graph.number_of_edges() == arcs
+    formats.export(dbn, tmp_path / "m.dot")
+    text = (tmp_path / "m.dot").read_text()
+    assert text.count(" -> ") == arcs and text.count("subgraph") == 2
+
+
+@pytest.mark.parametrize("name", ["jgum", "native"])
+def test_jgum_and_native_keep_every_bit_without_pyagrum(tmp_path, name):
+    dbn = toy()[0]
+    path = tmp_path / f"m{formats.FORMATS[name].suffix}"
+    formats.export(dbn, path)
+    assert same(formats.read(path), dbn)
+
+
+def test_damaged_jgum_gives_one_line(tmp_path):
+    import json
+
+    path = tmp_path / "m.jgum"
+    formats.export(toy()[0], path)
+    content = json.loads(path.read_text())
+    for change in (
+        lambda c: c.pop("properties"),
+        lambda c: c["cpt"].pop("front"),
+        lambda c: c["cpt"].update(front__swap=[1.0]),
+        lambda c: c["cpt"].update(front__swap=["a"] * 9),
+        lambda c: c["cpt"].update(front__swap=[0.9] * 9),
+        lambda c: c["parents"].update(front__swap=["goal"]),
+        lambda c: c["properties"].update({"nesy-2dbn": "{}"}),
+        lambda c: c["properties"].update({"nesy-2dbn": "["}),
+    ):
+        damaged = json.loads(json.dumps(content))
+        change(damaged)
+        path.write_text(json.dumps(damaged))
+        with pytest.raises(UserError) as caught:
+            formats.read(path)
+        assert "\n" not in str(caught.value)
+    path.write_text("{")
+    with pytest.raises(UserError, match="JSON"):
+        formats.read(path)
+
+
+def test_a_large_model_goes_through_the_formats_that_are_read_back(tmp_path):
+    import resource
+    import time
+
+    from nesy.dbn.model import TwoSliceDBN
+
+    rng = np.random.default_rng(0)
+    parents = [[sorted(rng.choice(20, 3, replace=False).tolist()) for _ in range(20)]]
+    dbn = TwoSliceDBN.from_tables([[rng.dirichlet(np.ones(16), size=16**3) for _ in range(20)]], parents)
+    for name in ("native", "parquet", "jgum"):
+        path = tmp_path / f"m{formats.FORMATS[name].suffix}"
+        started = time.process_time()
+        formats.export(dbn, path, format=name)
+        assert same(formats.read(path, format=name), dbn)
+        assert time.process_time() - started < 10
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < 2e6
+
+
+def test_a_failed_export_keeps_the_old_file(tmp_path, monkeypatch):
+    from nesy.formats import csv_table
+
+    path = tmp_path / "m.csv"
+    path.write_text("precious")
+
+    def broken(dbn):
+        yield from ()
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(csv_table, "parts", broken)
+    with pytest.raises(UserError, match="No space"):
+        formats.export(toy()[0], path)
+    assert path.read_text() == "precious" and len(list(tmp_path.iterdir())) == 1
