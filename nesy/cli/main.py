@@ -26,6 +26,7 @@ COMMANDS = {
     "show": "print or draw the 2DBN: its graph, its tables, what the values of a factor look like",
     "compare": "compare DQN, POMDP planner and references on the same maps",
     "report": "write report.html from the run folder",
+    "bench": "measure speeds, each against a named peer in the same run",
     "play": "drive the robot in a terminal, watch a policy, record an episode",
 }
 

@@ -12,12 +12,17 @@ from nesy.report import text
 
 
 def print_comparison(cells: list[dict[str, Any]]) -> None:
-    """Print the comparison on standard output; wide enough for every cell where that is not a terminal."""
+    """Print the comparison."""
     table = Table(title="Comparison (95 % intervals in brackets)", title_justify="left")
     for position, column in enumerate(text.COMPARISON_COLUMNS):
         table.add_column(column, justify="left" if position < 4 else "right", no_wrap=True)
     for row in text.comparison_rows(cells):
         table.add_row(*row)
+    print_wide(table)
+
+
+def print_wide(table: Table) -> None:
+    """Print a table on standard output; wide enough for every cell where that is not a terminal."""
     console = Console(file=sys.stdout)
     (console if console.is_terminal else Console(file=sys.stdout, width=160)).print(table)
 
