@@ -4,8 +4,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from domains.person_following.speed import benchmark as benchmark
     from domains.person_following.domain import DOMAIN as DOMAIN
+    from domains.person_following.speed import benchmark as benchmark
 
 __all__ = ["DOMAIN", "benchmark"]
 

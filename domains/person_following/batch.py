@@ -169,6 +169,12 @@ class Batch:
         else:
             self.last = last._replace(robot_view=last.final_view, configuration=last.final_configuration)
 
+    def begin_worlds(self, grids: NDArray[np.uint8], own: NDArray[np.int64]) -> None:
+        """Begin environment i on the raw map `grids[i]`, the candidate `own[i]` being the person's goal."""
+        self.world.grid[:] = grids
+        self._own = own.astype(np.int64)
+        self._begin_where(np.ones(self.num_envs, np.bool_))
+
     def follower_succeeds(self, grid: NDArray[np.uint8], starts: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether a greedy follower succeeds [B] on one map, the person at each of some starts [B, 2]."""
         self.world.grid[:] = grid

@@ -39,7 +39,8 @@ class StepTables(NamedTuple):
     far: NDArray[np.bool_]  # [P, C]: beyond the follow distance
     won: NDArray[np.bool_]  # [P, C]
     waits: NDArray[np.bool_]  # [P, C]: the person, before its move, wants to wait for a robot there
-    enters: NDArray[np.bool_]  # [C]: stepping forward from there enters the goal, if nobody blocks
+    enters: NDArray[np.bool_]  # [2, C]: stepping forward enters a goal, if nobody blocks; before and after
+    moved_at: int  # the step from which the second row of `enters` holds
     moves: NDArray[np.int64]  # [P, C, 4]
     successors: NDArray[np.int64]  # [P, 2]
     at_goal: NDArray[np.bool_]  # [P]
@@ -53,18 +54,20 @@ def step_tables(chain: PersonChain, parameters: Parameters) -> StepTables:
     front_x, front_y = x + ahead[h, 0], y + ahead[h, 1]
     far = chain.distance > parameters.follow_distance
     same = (people[:, None, 0] == x) & (people[:, None, 1] == y)
-    won = ~far & chain.visible & chain.at_goal[:, None]
-    near = np.where(chain.distance > 0, 1.5 / (1.0 + chain.distance), 0.0) + 0.5 * chain.visible
+    visible = chain.configuration > 0
+    won = ~far & visible & chain.at_goal[:, None]
+    near = np.where(chain.distance > 0, 1.5 / (1.0 + chain.distance), 0.0) + 0.5 * visible
     reward = np.where(far, -0.05 * chain.distance, near + 100.0 * won) - 0.01 * same
     bump = np.where((people[:, None, 0] == front_x) & (people[:, None, 1] == front_y), -0.01, 0.0)
-    waits = (~chain.visible | far) if parameters.look_back else np.zeros_like(far)
+    waits = (~visible | far) if parameters.look_back else np.zeros_like(far)
     return StepTables(
         reward,
         bump,
         far,
         won,
         waits,
-        chain.grid[front_x, front_y] == GOAL,
+        np.stack([chain.grid[front_x, front_y] == GOAL, chain.grid_after[front_x, front_y] == GOAL]),
+        chain.moved_at,
         chain.moves,
         chain.successors,
         chain.at_goal,
@@ -94,7 +97,7 @@ def reachable_states(rules, successors, reached):  # type: ignore[no-untyped-def
 @inner
 def _arrive(rules, tables, reached, discount, t, value, total, success, arrive):  # type: ignore[no-untyped-def]
     """Fill `arrive` [3, P, W, C, G, L]: what arriving in a state at the end of step t is worth."""
-    reward, _, far, won, _, _, _, _, at_goal = tables
+    reward, _, far, won, _, _, _, _, _, at_goal = tables
     patience, max_lost = rules[R_GOAL_PATIENCE], rules[R_MAX_LOST]
     _, people, waits, poses, stands, losts = arrive.shape
     last = t == reached.shape[0] - 1
@@ -133,7 +136,7 @@ def sweep_backward(rules, tables, reached, discount, policy, value, total, succe
 
     `value` is discounted; `total` and `success` are the undiscounted return and the success of the policy.
     """
-    reward, bump, _, won, waits, enters, moves, successors, at_goal = tables
+    reward, bump, _, won, waits, enters, moved_at, moves, successors, at_goal = tables
     steps, people, num_waits, poses, stands, losts = policy.shape
     arrive = np.zeros((3, people, num_waits, poses, stands, losts))
     first, second = np.empty(NUM_ACTIONS, np.int64), np.empty(NUM_ACTIONS, np.int64)
@@ -144,6 +147,7 @@ def sweep_backward(rules, tables, reached, discount, policy, value, total, succe
         _arrive(rules, tables, reached, discount, t, value, total, success, arrive)
         rests = rules[R_PERSON_REST] > 0 and (t + 1) % rules[R_PERSON_REST] == 0
         held = rules[R_ROBOT_REST] > 0 and (t + 1) % rules[R_ROBOT_REST] == 0
+        after = 1 if t + 1 >= moved_at else 0
         bonus = 1.0 - 0.9 * ((t + 1) / rules[R_MAX_STEPS])
         for p in range(people):
             # On the way the counter at the goal is 0; at the goal it is at least 1.
@@ -164,7 +168,7 @@ def sweep_backward(rules, tables, reached, discount, policy, value, total, succe
                         extra[action], ends[action] = 0.0, False
                         if act == FORWARD:
                             extra[action] = 0.5 * (bump[first[action], to[action]] + bump[second[action], to[action]])
-                            if to[action] != c and enters[c]:
+                            if to[action] != c and enters[after, c]:
                                 # The episode ends here, with what this step alone brings.
                                 extra[action] += bonus
                                 ends[action] = True
@@ -199,7 +203,7 @@ def follow_policy(rules, tables, policy, start, states, actions):  # type: ignor
 
     Collecting stops when the arrays are full.
     """
-    _, _, far, won, waits, enters, moves, successors, at_goal = tables
+    _, _, far, won, waits, enters, moved_at, moves, successors, at_goal = tables
     patience = rules[R_GOAL_PATIENCE]
     seen = np.zeros(policy.shape[1:], np.int32)
     count = policy.shape[2]
@@ -224,7 +228,7 @@ def follow_policy(rules, tables, policy, start, states, actions):  # type: ignor
         if rules[R_ROBOT_REST] > 0 and (t + 1) % rules[R_ROBOT_REST] == 0:
             chosen = STAY
         to = moves[p, c, chosen]
-        if t + 1 >= policy.shape[0] or (chosen == FORWARD and to != c and enters[c]):
+        if t + 1 >= policy.shape[0] or (chosen == FORWARD and to != c and enters[1 if t + 1 >= moved_at else 0, c]):
             continue
         for branch in range(2):
             after, w2 = successors[p, branch], 0

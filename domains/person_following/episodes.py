@@ -30,6 +30,8 @@ from domains.person_following.world import (
     HEADING,
     LAST_ACTION,
     LOST,
+    MOVES,
+    OWN,
     PLAN_AT,
     PLAN_LENGTH,
     SLOT,
@@ -141,6 +143,7 @@ def _begin(rules, world, store, b, x, y, own):  # type: ignore[no-untyped-def]
     count = _place_goals(rules, world, store, b, x, y)
     if own < 0:
         own = draw_below(world.stream, b, count)
+    person[b, OWN], person[b, MOVES] = own, 0
     goal_x, goal_y = world.goals[b, own, 0], world.goals[b, own, 1]
     person[b, GOAL_X], person[b, GOAL_Y] = goal_x, goal_y
     person[b, BELIEVED_X], person[b, BELIEVED_Y] = goal_x, goal_y

@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from domains.core import GOAL, LEFT, BatchedEnvironment, DomainError, OracleResult
+from domains.core import LEFT, BatchedEnvironment, DomainError, OracleResult
 from domains.person_following.dynamic_programming import (
     follow_policy,
     reachable_states,
@@ -25,7 +25,7 @@ from domains.person_following.person_chain import (
     PENDING_NONE,
     PENDING_RIGHT,
     PersonChain,
-    person_chain,
+    person_chains,
 )
 from domains.person_following.store import map_hash
 from domains.person_following.variants import Parameters
@@ -33,6 +33,8 @@ from domains.person_following.world import (
     AT_GOAL,
     HEADING,
     LOST,
+    MOVES,
+    OWN,
     PLAN_AT,
     PLAN_LENGTH,
     TIME,
@@ -43,12 +45,11 @@ from domains.person_following.world import (
 )
 
 _ROBOT_START = (1, 1, 0)
-_PERSON_START = (2, 2, 0)
 _MAX_REACHED = 1 << 20
 
 
 class _Solved:
-    """One map: what the policy does in the states it reaches, and what is needed to ask about others."""
+    """One world: what the policy does in the states it reaches, and what is needed to ask about others."""
 
     def __init__(self, chain: PersonChain, parameters: Parameters, policy: NDArray[np.int8]) -> None:
         states = np.empty((_MAX_REACHED, 6), np.int32)
@@ -57,9 +58,7 @@ class _Solved:
         count = follow_policy(
             parameters.rules(following=True), step_tables(chain, parameters), policy, start, states, actions
         )
-        self.pose_index = chain.pose_index
-        self.route_length = chain.route_length
-        self.goal = tuple(int(v) for v in np.argwhere(chain.grid == GOAL)[0])
+        self.chain = chain
         self.actions = {
             tuple(state): int(action) for state, action in zip(states[:count].tolist(), actions[:count], strict=True)
         }
@@ -67,33 +66,31 @@ class _Solved:
     def state_of(self, world: World, parameters: Parameters, b: int) -> tuple[int, ...]:
         """(t, p, w, c, g, l) of environment b."""
         robot, person = world.robot[b].tolist(), world.person[b].tolist()
-        at, length = person[PLAN_AT], person[PLAN_LENGTH]
-        if (person[X], person[Y]) != self.goal:
-            person_state = at
-        else:
+        length = self.chain.route_length
+        person_state = min(person[MOVES], length)
+        if person_state == length and parameters.turns_at_goal:
+            at = person[PLAN_AT]
             pending = PENDING_NONE
-            if at < length:
+            if person[MOVES] > length and at < person[PLAN_LENGTH]:
                 pending = PENDING_LEFT if world.plan[b, at] == LEFT else PENDING_RIGHT
-            person_state = self.route_length + 1 + person[HEADING] * 3 + pending
+            person_state = length + 1 + person[HEADING] * 3 + pending
         return (
             robot[TIME],
             person_state,
             person[WAITING] if parameters.look_back else 0,
-            int(self.pose_index[robot[X], robot[Y], robot[HEADING]]),
+            int(self.chain.pose_index[robot[X], robot[Y], robot[HEADING]]),
             min(robot[AT_GOAL], parameters.goal_patience + 1),
             robot[LOST],
         )
 
 
 class FullStatePolicy:
-    """The optimal policy of some maps, for evaluation on any environment that plays them."""
+    """The optimal policy of some worlds, for evaluation on any environment that plays them."""
 
-    def __init__(
-        self, grids: NDArray[np.uint8], parameters: Parameters, discount: float, solved: list[_Solved]
-    ) -> None:
-        """Keep the maps as played, and the actions in the states that the policy reaches on each."""
-        self._grids, self._parameters, self._discount, self._solved = grids, parameters, discount, solved
-        self._index = {int(map_hash(grids, m)): m for m in range(len(grids))}
+    def __init__(self, parameters: Parameters, discount: float, solved: list[_Solved]) -> None:
+        """Keep the worlds and, for each, the actions in the states that the policy reaches."""
+        self._parameters, self._discount, self._solved = parameters, discount, solved
+        self._index = {(int(map_hash(one.chain.grid[None], 0)), one.chain.own): i for i, one in enumerate(solved)}
         self._whole_policy = lru_cache(maxsize=8)(self._solve_again)
 
     def actions(self, env: BatchedEnvironment) -> NDArray[np.int64]:
@@ -108,53 +105,54 @@ class FullStatePolicy:
         world: World = batch.world
         actions = np.empty(env.num_envs, np.int64)
         for b in range(env.num_envs):
-            m = self._index.get(int(world.map_id[b]))
-            if m is None:
+            i = self._index.get((int(world.map_id[b]), int(world.person[b, OWN])))
+            if i is None:
                 raise DomainError("the environment plays a map that this optimum was not solved for")
-            state = self._solved[m].state_of(world, self._parameters, b)
-            action = self._solved[m].actions.get(state)
-            actions[b] = self._whole_policy(m)[state] if action is None else action
+            state = self._solved[i].state_of(world, self._parameters, b)
+            action = self._solved[i].actions.get(state)
+            actions[b] = self._whole_policy(i)[state] if action is None else action
         return actions
 
-    def _solve_again(self, m: int) -> NDArray[np.int8]:
-        chain = person_chain(self._grids[m], _PERSON_START, self._parameters)
-        return _sweep(chain, self._parameters, self._discount)[0]
+    def _solve_again(self, i: int) -> NDArray[np.int8]:
+        return sweep(self._solved[i].chain, self._parameters, self._discount)[0]
 
 
 def full_state_optimum(
     grids: NDArray[np.uint8], weights: NDArray[np.float64], parameters: Parameters, discount: float
 ) -> OracleResult:
-    """Solve every map [M, size, size]; averages are taken with `weights` [M].
+    """Solve every world: every raw map [M, size, size] with each of its candidate goals.
+
+    Averages are taken with `weights` [M], the candidates of a map being equally likely; the arrays by map have
+    one entry per world, the candidates of a map side by side.
 
     Raises:
-        DomainError: a discount outside 0..1.
+        DomainError: a discount outside 0..1, or rules that dynamic programming does not cover.
     """
     if not 0.0 <= discount <= 1.0:
         raise DomainError(f"discount must be in 0..1, got {discount}")
-    played = grids.copy()
-    played[:, _PERSON_START[0], _PERSON_START[1]] = 0
-    values, returns, successes = (np.empty(len(grids)) for _ in range(3))
+    chains = person_chains(grids, parameters)
+    values, returns, successes = (np.empty(len(chains)) for _ in range(3))
     solved = []
-    for m, grid in enumerate(played):
-        chain = person_chain(grid, _PERSON_START, parameters)
-        policy, *tables = _sweep(chain, parameters, discount)
+    for i, chain in enumerate(chains):
+        policy, *tables = sweep(chain, parameters, discount)
         start = chain.pose_index[_ROBOT_START]
-        values[m], returns[m], successes[m] = (table[0, 0, 0, start, 0, 0] for table in tables)
+        values[i], returns[i], successes[i] = (table[0, 0, 0, start, 0, 0] for table in tables)
         solved.append(_Solved(chain, parameters, policy))
+    shares = np.repeat(weights / parameters.num_goals, parameters.num_goals)
     return OracleResult(
-        value=float(values @ weights),
-        mean_return=float(returns @ weights),
-        success=float(successes @ weights),
+        value=float(values @ shares),
+        mean_return=float(returns @ shares),
+        success=float(successes @ shares),
         map_value=values,
         map_return=returns,
         map_success=successes,
-        weights=weights,
+        weights=shares,
         discount=discount,
-        policy=FullStatePolicy(played, parameters, discount, solved),
+        policy=FullStatePolicy(parameters, discount, solved),
     )
 
 
-def _sweep(
+def sweep(
     chain: PersonChain, parameters: Parameters, discount: float
 ) -> tuple[NDArray[np.int8], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Policy [T, P, W, C, G, L], and tables of which [0] is t = 0: value, undiscounted return, success."""

@@ -28,6 +28,7 @@ from domains.person_following.world import (
     GOAL_Y,
     HEADING,
     LAST_ACTION,
+    MOVES,
     PLAN_AT,
     PLAN_LENGTH,
     TIME,
@@ -160,6 +161,7 @@ def move_persons(rules, world, store, configurations, gaps):  # type: ignore[no-
                 continue
         action = plan[b, person[b, PLAN_AT]]
         person[b, PLAN_AT] += 1
+        person[b, MOVES] += 1
         person[b, LAST_ACTION] = action
         heading = person[b, HEADING]
         if action == LEFT:

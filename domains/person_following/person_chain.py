@@ -1,41 +1,48 @@
 """The person as a Markov chain of its own: what it does next depends on the robot only through waiting.
 
-    states      0..L: k actions of the plan are done; then, at the goal, heading x pending turn
+    states      0..L: that many actions done on the way to the goal; then, if it turns about there,
+                heading x pending turn
     successors  one each, but two equally likely ones where the person draws the way to turn about
 
-The oracles need this chain, and distances and visibility from every robot pose to every state of it.
+The way is found by playing: the compiled rules walk the person of every world once, with nobody to wait for.
+The oracles need these chains, and distances and visibility from every robot pose to every state of them.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from domains.core import FORWARD, LEFT, RIGHT, WALL
+from domains.core import STAY, WALL, DomainError
+from domains.person_following.batch import Batch
 from domains.person_following.compiled import entry
 from domains.person_following.paths import (
     HEADING_ALWAYS,
     HEADING_NEVER,
     NO_PATH,
-    Scratch,
     allocate_scratch,
-    astar,
     distance_field,
     step_x,
     step_y,
 )
 from domains.person_following.variants import Parameters
 from domains.person_following.views import configuration_of, look, relative
+from domains.person_following.world import GOAL_X, GOAL_Y
 
 PENDING_NONE, PENDING_LEFT, PENDING_RIGHT = 0, 1, 2
+NEVER = 1 << 30
 
 
 class PersonChain(NamedTuple):
-    """One map with its person: P states, C robot poses on free cells (numbered by `pose_index`)."""
+    """One world, a map with its person: P states, C robot poses on free cells (numbered by `pose_index`)."""
 
-    grid: NDArray[np.uint8]  # [size, size]
+    grid: NDArray[np.uint8]  # [size, size]: at the start
+    grid_after: NDArray[np.uint8]  # [size, size]: from step `moved_at` on
+    moved_at: int
+    own: int  # number of the candidate that is the person's goal at the start
     poses: NDArray[np.int64]  # [C, 3]
     pose_index: NDArray[np.int64]  # [size, size, 4]: number of a pose, -1 in walls
     person: NDArray[np.int64]  # [P, 3]
@@ -43,83 +50,121 @@ class PersonChain(NamedTuple):
     successors: NDArray[np.int64]  # [P, 2]; both the same where the next state is certain
     route_length: int  # L: states 0..L are on the way, L + 1 + heading * 3 + pending at the goal
     distance: NDArray[np.int16]  # [P, C]: from the robot's pose to the person's, 0 where no path exists
-    visible: NDArray[np.bool_]  # [P, C]
     configuration: NDArray[np.int64]  # [P, C]: of the person in the robot's view
     moves: NDArray[np.int64]  # [P, C, 4]: the robot's next pose
 
 
-def person_chain(grid: NDArray[np.uint8], start: tuple[int, int, int], parameters: Parameters) -> PersonChain:
-    """The chain of a person that starts somewhere on a map as played (its start cell free)."""
-    size = len(grid)
-    goal_x, goal_y = (int(v) for v in np.argwhere(grid == 2)[0])
-    scratch = allocate_scratch(size)
-    length = astar(grid[None], 0, *start, goal_x, goal_y, -1, False, scratch)
-    route = scratch.path[: max(length, 0)].tolist()
-    person = [start]
-    for action in route:
-        x, y, h = person[-1]
-        if action == FORWARD:
-            x, y = x + step_x(h), y + step_y(h)
-        else:
-            h = (h + (3 if action == LEFT else 1)) % 4
-        person.append((x, y, h))
-    length = len(route)
-    first_turn = length + 1
+def person_chains(grids: NDArray[np.uint8], parameters: Parameters) -> list[PersonChain]:
+    """The chains of all worlds on raw maps [M, size, size]: for each map, one for each candidate goal.
+
+    Raises:
+        DomainError: rules under which the person is not such a chain.
+    """
+    if parameters.num_persons > 1:
+        raise DomainError("oracles need num_persons = 1: the others walk at random")
+    if parameters.goal_moves_at and (parameters.look_back or parameters.person_rest):
+        raise DomainError("oracles need look_back=False and person_rest=0 where goal_moves_at is set")
+    count = parameters.num_goals
+    alone = dataclasses.replace(parameters, look_back=False, person_rest=0, max_steps=1 << 20)
+    batch = Batch("following", len(grids) * count, alone)
+    batch.starts = batch.starts.sharing(parameters)
+    batch.begin_worlds(np.repeat(grids, count, axis=0), np.tile(np.arange(count), len(grids)))
+    world = batch.world
+    first_grids = world.grid.copy()
+    people, goals, grids_now = [world.person[:, :3].copy()], [world.person[:, [GOAL_X, GOAL_Y]]], [first_grids]
+    stay = np.full(batch.num_envs, STAY, np.int64)
+    arrived = np.zeros(batch.num_envs, np.bool_)
+    for _ in range(16 * parameters.size**2):
+        arrived |= (people[-1][:, :2] == goals[-1]).all(axis=1)
+        if arrived.all():
+            break
+        batch.step(stay, False)
+        people.append(world.person[:, :3].copy())
+        goals.append(world.person[:, [GOAL_X, GOAL_Y]])
+        if parameters.goal_moves_at:
+            grids_now.append(world.grid.copy())
+    else:
+        raise DomainError("a person never reaches its goal on some map")
+    chains = []
+    for i in range(batch.num_envs):
+        there = [bool((p[i, :2] == g[i]).all()) for p, g in zip(people, goals, strict=True)]
+        route = np.array([p[i] for p in people[: there.index(True) + 1]], np.int64)
+        moved = [t for t, grid in enumerate(grids_now) if (grid[i] != first_grids[i]).any()]
+        after = grids_now[moved[0]][i] if moved else first_grids[i]
+        chains.append(_chain(first_grids[i], after, moved[0] if moved else NEVER, i % count, route, parameters))
+    return chains
+
+
+def _chain(
+    grid: NDArray[np.uint8],
+    grid_after: NDArray[np.uint8],
+    moved_at: int,
+    own: int,
+    route: NDArray[np.int64],
+    parameters: Parameters,
+) -> PersonChain:
+    size, length = len(grid), len(route) - 1
+    person = route.tolist()
     successors = [(k + 1, k + 1) for k in range(length)]
     x, y, h = person[-1]
-    if (x, y) != (goal_x, goal_y):
-        raise ValueError("the person cannot reach its goal on this map")
-    # State L (just arrived) is the same as "at the goal, nothing pending".
-    arrived = first_turn + h * 3
-    successors.append((-1, -1))
-    for heading in range(4):
-        left, right = (heading + 3) % 4, (heading + 1) % 4
-        for pending in range(3):
-            person.append((goal_x, goal_y, heading))
-            if pending == PENDING_NONE:
-                pair = (first_turn + left * 3 + PENDING_LEFT, first_turn + right * 3 + PENDING_RIGHT)
-            else:
-                then = left if pending == PENDING_LEFT else right
-                pair = (first_turn + then * 3, first_turn + then * 3)
-            successors.append(pair)
-    successors[length] = successors[arrived]
+    first_turn = length + 1
+    if parameters.turns_at_goal:
+        for heading in range(4):
+            left, right = (heading + 3) % 4, (heading + 1) % 4
+            for pending in range(3):
+                person.append([x, y, heading])
+                if pending == PENDING_NONE:
+                    pair = (first_turn + left * 3 + PENDING_LEFT, first_turn + right * 3 + PENDING_RIGHT)
+                else:
+                    then = left if pending == PENDING_LEFT else right
+                    pair = (first_turn + then * 3, first_turn + then * 3)
+                successors.append(pair)
+        # Just arrived is the same as being at the goal with nothing pending.
+        successors.insert(length, successors[length + h * 3])
+    else:
+        successors.append((length, length))
     people = np.array(person, np.int64)
-    at_goal = (people[:, 0] == goal_x) & (people[:, 1] == goal_y)
     pose_index = np.full((size, size, 4), -1, np.int64)
-    free = np.argwhere(grid != WALL)
-    poses = np.array([(x, y, h) for x, y in free for h in range(4)], np.int64)
+    poses = np.array([(cx, cy, ch) for cx, cy in np.argwhere(grid != WALL) for ch in range(4)], np.int64)
     pose_index[poses[:, 0], poses[:, 1], poses[:, 2]] = np.arange(len(poses))
     shape = (len(people), len(poses))
     distance = np.empty(shape, np.int16)
     configuration = np.empty(shape, np.int64)
     moves = np.empty((*shape, 4), np.int64)
     view = np.empty((1, parameters.view_size, parameters.view_size), np.uint8)
-    _fill(
-        grid[None],
-        poses,
-        pose_index,
-        people,
-        parameters.heading_rule,
-        parameters.see_through_walls,
-        view,
-        distance,
-        configuration,
-        moves,
-        scratch,
-    )
+    see_through = parameters.see_through_walls
+    tables = (distance, configuration, moves)
+    scratch = allocate_scratch(size)
+    _fill(grid[None], poses, pose_index, people, parameters.heading_rule, see_through, view, *tables, scratch)
     return PersonChain(
         grid,
+        grid_after,
+        moved_at,
+        own,
         poses,
         pose_index,
         people,
-        at_goal,
+        np.arange(len(people)) >= length,
         np.array(successors, np.int64),
         length,
-        distance,
-        configuration > 0,
-        configuration,
-        moves,
+        *tables,
     )
+
+
+def pose_views(chain: PersonChain, parameters: Parameters) -> NDArray[np.uint8]:
+    """Views [2, C, v, v] of all robot poses, before and after the goal has moved."""
+    width = parameters.view_size
+    views = np.empty((2, len(chain.poses), width, width), np.uint8)
+    grids = np.stack([chain.grid, chain.grid_after])
+    for k in range(2):
+        _look_around(grids, k, chain.poses, parameters.see_through_walls, views[k])
+    return views
+
+
+@entry
+def _look_around(grids, b, poses, see_through, views):  # type: ignore[no-untyped-def]
+    for c in range(poses.shape[0]):
+        look(grids, b, poses[c, 0], poses[c, 1], poses[c, 2], see_through, views, c)
 
 
 @entry
@@ -148,6 +193,3 @@ def _fill(  # type: ignore[no-untyped-def]
         for c in range(poses.shape[0]):
             found = field[(poses[c, 0] * size + poses[c, 1]) * 4 + poses[c, 2]]
             distance[p, c] = 0 if found == NO_PATH else found
-
-
-__all__ = ["PENDING_LEFT", "PENDING_NONE", "PENDING_RIGHT", "RIGHT", "PersonChain", "Scratch", "person_chain"]

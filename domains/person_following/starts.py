@@ -40,6 +40,10 @@ class Starts:
         self._known: dict[bytes, tuple[int, int]] = {}
         self._trial: Batch | None = None
 
+    def sharing(self, parameters: Parameters) -> Starts:
+        """Starts as they are under other parameters."""
+        return Starts(parameters)
+
     def of(self, grids: NDArray[np.uint8]) -> NDArray[np.int64]:
         """Starts [B, 2] on maps [B, size, size]."""
         if self.parameters.person_start == "corner":

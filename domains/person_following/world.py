@@ -13,7 +13,8 @@ from domains.person_following.variants import MAX_GOALS, Parameters
 
 # Columns of `World.robot`; SLOT is the map's place in the store, AT_GOAL counts steps of the person at its goal.
 X, Y, HEADING, LOST, TIME, SLOT, EPISODE, AT_GOAL, ROBOT_COLUMNS = range(9)
-# Columns of `World.person`; the first three are X, Y, HEADING too.
+# Columns of `World.person`; the first three are X, Y, HEADING too. OWN is the number of the candidate that was the
+# person's goal at first, MOVES counts its actions other than waiting.
 (
     WAITING,
     PLAN_AT,
@@ -23,8 +24,10 @@ X, Y, HEADING, LOST, TIME, SLOT, EPISODE, AT_GOAL, ROBOT_COLUMNS = range(9)
     LAST_ACTION,
     BELIEVED_X,
     BELIEVED_Y,
+    OWN,
+    MOVES,
     PERSON_COLUMNS,
-) = range(3, 12)
+) = range(3, 14)
 
 
 class World(NamedTuple):
