@@ -194,7 +194,7 @@ class Reference:
             nx, ny = x + STEPS[h][0], y + STEPS[h][1]
             if self.grid[nx][ny] != 1 and (nx, ny) != self.person[:2]:
                 self.agent = (nx, ny, h)
-                entered = self.grid[nx][ny] == 2
+                entered = (nx, ny) == self.goal
         reward = 1 - 0.9 * (self.t / self.max_steps) if entered else 0.0
 
         did = self.person_step()
