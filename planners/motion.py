@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 NUM_MOTIONS, NUM_MOVES, NUM_HEADINGS = 4, 4, 4
 FORWARD, STAY = 2, 3
+WAIT = 3
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,7 @@ def learn_motion(experience: Experience) -> tuple[RelativeMotion, np.ndarray]:
         1
     )
     _fit(motion, FORWARD, before, after, move, forward & moved)
+    _compose(motion)
     return motion, moved
 
 
@@ -102,8 +104,7 @@ def _fit(
             chosen = rows & (move == u) & (before[:, 2] == h)
             homogeneous = np.concatenate([before[chosen, :2], np.ones((chosen.sum(), 1), np.int64)], axis=1)
             if np.linalg.matrix_rank(homogeneous) < 3:
-                _borrow(motion, m, u, h)
-                continue
+                continue  # too few different examples; `_compose` fills it in
             solution, *_ = np.linalg.lstsq(homogeneous, after[chosen, :2], rcond=None)
             motion.coefficients[m, u, h] = np.rint(solution.T)
             motion.next_heading[m, u, h] = np.bincount(after[chosen, 2], minlength=NUM_HEADINGS).argmax()
@@ -112,14 +113,16 @@ def _fit(
             motion.counts[m, u, h] = chosen.sum(), right.sum()
 
 
-def _borrow(motion: RelativeMotion, m: int, u: int, h: int) -> None:
-    """Too few examples for a map of its own: compose those of "only the robot moves" and "only the person does"."""
-    robot, person = motion.coefficients[m, STAY, h], motion.coefficients[STAY, u, h]
-    if m == STAY or u == STAY or not robot.any() or not person.any():
-        motion.coefficients[m, u, h] = np.eye(2, 3, dtype=np.int64)
-        motion.next_heading[m, u, h] = h
-        return
-    # The person's own move happens in the robot's frame, which the robot's motion then carries along.
-    carried = robot[:, :2] @ person[:, 2] + robot[:, 2]
-    motion.coefficients[m, u, h] = np.concatenate([robot[:, :2] @ person[:, :2], carried[:, None]], axis=1)
-    motion.next_heading[m, u, h] = motion.next_heading[m, STAY, int(motion.next_heading[STAY, u, h])]
+def _compose(motion: RelativeMotion) -> None:
+    """Where there were too few examples for a map: first the robot alone moves, then the person alone does."""
+    for m, u, h in np.argwhere(motion.counts[..., 0] == 0):
+        middle = int(motion.next_heading[m, WAIT, h])
+        parts_known = motion.counts[m, WAIT, h, 0] > 0 and motion.counts[STAY, u, middle, 0] > 0
+        if m == STAY or u == WAIT or not parts_known:
+            motion.coefficients[m, u, h] = np.eye(2, 3, dtype=np.int64)
+            motion.next_heading[m, u, h] = h
+            continue
+        robot, person = motion.coefficients[m, WAIT, h], motion.coefficients[STAY, u, middle]
+        offset = person[:, :2] @ robot[:, 2] + person[:, 2]
+        motion.coefficients[m, u, h] = np.concatenate([person[:, :2] @ robot[:, :2], offset[:, None]], axis=1)
+        motion.next_heading[m, u, h] = motion.next_heading[STAY, u, middle]
