@@ -22,10 +22,19 @@ COLOURS = ("#f2f0e9", "#4a4e54", "#3c9a5f", "#c9c4b8")
 
 
 def draw_graph(dbn: TwoSliceDBN, path: Path | str, action: int | None = None) -> None:
-    """Draw the graph, one panel per action: slice t left, slice t+1 right, arrows as wide as they are strong.
+    """Draw the graph into a file; see `graph_figure`.
 
     Raises:
         UserError: no such action, or an ending that is no picture format.
+    """
+    _save(graph_figure(dbn, action), path)
+
+
+def graph_figure(dbn: TwoSliceDBN, action: int | None = None) -> Figure:
+    """The graph, one panel per action: slice t left, slice t+1 right, arrows as wide as they are strong.
+
+    Raises:
+        UserError: no such action.
     """
     from matplotlib.figure import Figure
 
@@ -36,7 +45,7 @@ def draw_graph(dbn: TwoSliceDBN, path: Path | str, action: int | None = None) ->
     axes = figure.subplots(1, len(chosen), squeeze=False)[0]
     for a, axis in zip(chosen, axes, strict=True):
         _panel(dbn, a, axis)
-    _save(figure, path)
+    return figure
 
 
 def _panel(dbn: TwoSliceDBN, action: int, axis: Axes) -> None:

@@ -114,16 +114,21 @@ def plan_marginals(
     evidence = evidence or {}
     needed: list[set[int]] = [set() for _ in range(len(plan) + 1)]
     needed[-1] = set(factors)
-    for (step, factor), _ in evidence.items():
+    for step, factor in evidence:
         needed[step].add(factor)
     for step in range(len(plan), 0, -1):
         needed[step] = set(ancestors(dbn, plan[step - 1], tuple(needed[step])))
         needed[step - 1] |= {p for i in needed[step] for p in dbn.parents_now[plan[step - 1]][i]}
-    potentials: list[Potential] = [((i,), belief[i]) for i in sorted(needed[0])]
+    # values that the start rules out are cut away: from a code, slice 0 disappears altogether
+    full = np.arange(k)
+    supports = [np.flatnonzero(row) for row in belief]
+    potentials: list[Potential] = [((i,), belief[i][supports[i]]) for i in sorted(needed[0])]
     for step, action in enumerate(plan):
         for i in sorted(needed[step + 1]):
-            scope = tuple((step + where) * n + p for where, p in dbn.parents(action, i)) + ((step + 1) * n + i,)
-            potentials.append((scope, dbn.tensor(action, i)))
+            parents = dbn.parents(action, i)
+            index = np.ix_(*(supports[p] if step + where == 0 else full for where, p in parents), full)
+            scope = tuple((step + where) * n + p for where, p in parents) + ((step + 1) * n + i,)
+            potentials.append((scope, dbn.tensor(action, i)[index]))
     fixed = {step * n + factor: value for (step, factor), value in evidence.items()}
     potentials = [_fix(potential, fixed) for potential in potentials]
     return contract(potentials, tuple(len(plan) * n + i for i in factors))
