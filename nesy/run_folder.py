@@ -16,6 +16,11 @@ from typing import Any
 
 from nesy.errors import UserError
 
+# Some writers (safetensors) make files that only their owner can read; a run is as readable as any other file.
+_UMASK = os.umask(0o022)
+os.umask(_UMASK)
+_FILE_MODE = 0o666 & ~_UMASK
+
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
@@ -29,6 +34,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
         yield temporary
+        temporary.chmod(_FILE_MODE)
         with temporary.open("rb") as stream:
             os.fsync(stream.fileno())
         temporary.replace(path)

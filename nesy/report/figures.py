@@ -50,11 +50,11 @@ class BeliefExample:
     actions: tuple[str, ...]
 
 
-def _svg(figure: Figure) -> str:
+def svg(figure: Figure) -> str:
     """The figure as an inline <svg> element, with no date in it so that the same data give the same text."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", bbox_inches="tight", metadata={"Date": None})
-    plt.close(figure)
+    plt.close(figure)  # a no-op for figures made without pyplot
     text = buffer.getvalue()
     return text[text.index("<svg") :]
 
@@ -75,7 +75,7 @@ def comparison(cells: Sequence[dict[str, Any]]) -> str:
     axes.invert_yaxis()
     axes.set_xlabel("return per episode (mean, 95 % interval; dotted: exact optimum)")
     axes.grid(axis="x", alpha=0.3)
-    return _svg(figure)
+    return svg(figure)
 
 
 def learning_curves(curves: dict[str, np.ndarray], optimum: float | None, window: int) -> str:
@@ -93,7 +93,7 @@ def learning_curves(curves: dict[str, np.ndarray], optimum: float | None, window
     axes.set_ylabel(f"return, mean of the last {window}")
     axes.grid(alpha=0.3)
     axes.legend(loc="best", fontsize=9)
-    return _svg(figure)
+    return svg(figure)
 
 
 def belief_panel(example: BeliefExample) -> str:
@@ -108,7 +108,7 @@ def belief_panel(example: BeliefExample) -> str:
     _view(axes[1, 2], example.decoded_shifted, "b~ decoded")
     figure.suptitle("imagined actions: " + (", ".join(example.actions) or "none"), fontsize=10)
     figure.tight_layout()
-    return _svg(figure)
+    return svg(figure)
 
 
 def _view(axes: Axes, view: np.ndarray, title: str) -> None:

@@ -35,7 +35,7 @@ def write_report(run: RunFolder, progress: Progress = SILENT) -> Path:
         ("comparison", "Comparison", lambda: _comparison(summary)),
         ("learning", "Learning curves", lambda: _learning(run, summary)),
         ("belief", "Belief and shifted belief", lambda: _belief(run)),
-        ("world-model", "World model", lambda: _figures_table(summary["world_model"], "Gates of the world model")),
+        ("world-model", "World model", lambda: _world_model(summary["world_model"])),
         ("dbn", "Symbolic 2DBN", lambda: _dbn(run, summary)),
         ("provenance", "How it was made", lambda: _provenance(summary)),
     )
@@ -130,8 +130,31 @@ def _belief(run: RunFolder) -> str:
     )
 
 
+def _world_model(gates: dict[str, Any]) -> str:
+    """The gates on all data and on held-out maps, each beside what the data allow at best."""
+    held_out, names = gates.get("held_out", {}), [n for n, value in gates.items() if isinstance(value, int | float)]
+    rows = [
+        [name, number(gates[name]), *(_cell(part, name) for part in (gates.get("limits", {}), gates.get("passed", {}))),
+         _cell(held_out, name), _cell(held_out.get("limits", {}), name)]
+        for name in names
+    ]  # fmt: skip
+    columns = ("gate", "figure", "limit of the data", "passed", "held-out maps", "limit there")
+    usage = ", ".join(f"{value:.1f}" for value in gates.get("perplexity", ()))
+    return _table(columns, rows, "Gates of the world model.") + (
+        f"<p>Perplexity of the values of each factor: {usage}.</p>" if usage else ""
+    )
+
+
+def _cell(figures: dict[str, Any], name: str) -> str:
+    value = figures.get(name)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return "" if value is None else number(value)
+
+
 def _dbn(run: RunFolder, summary: dict[str, Any]) -> str:
     from nesy.dbn import TwoSliceDBN, describe
+    from nesy.dbn.drawing import graph_figure
 
     dbn = TwoSliceDBN.load(run.dbn)
     rows = [
@@ -151,11 +174,17 @@ def _dbn(run: RunFolder, summary: dict[str, Any]) -> str:
         text_columns=1 + len(dbn.action_names),
     )
     action = dbn.action_names.index("forward") if "forward" in dbn.action_names else 0
+    graph = _figure(
+        figures.svg(graph_figure(dbn)),
+        "Parents of every factor per action; arrows as wide as they are strong, brown inside slice t+1.",
+        "Graph of the 2DBN",
+    )
     lines = describe(dbn, factor=dbn.order[0], action=action).splitlines()
     excerpt = "\n".join(lines[:40]) + ("\n..." if len(lines) > 40 else "")
     command = f"nesy extract --run {run.path} --table --factor {dbn.order[0]} --action {dbn.action_names[action]}"
     return (
         _figures_table(summary["dbn"], "Figures of the extraction")
+        + graph
         + parents
         + f"<p>An excerpt; all of it: <code>{html.escape(command)}</code></p><pre>{html.escape(excerpt)}</pre>"
     )
