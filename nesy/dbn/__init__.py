@@ -12,6 +12,7 @@ _WHERE = {
     "TwoSliceDBN": "nesy.dbn.model",
     "Codebook": "nesy.dbn.codebook",
     "Packed": "nesy.dbn.kernels",
+    "ParticleFilter": "nesy.dbn.particles",
     "packed": "nesy.dbn.kernels",
     "sample_codes": "nesy.dbn.kernels",
     "FactoredUpdates": "nesy.dbn.factored",
