@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from domains.core import FORWARD, GOAL, STAY
+from domains.core import FORWARD, STAY
 from domains.person_following.compiled import entry, inner
 from domains.person_following.paths import step_x, step_y
 from domains.person_following.person_chain import PersonChain
@@ -66,7 +66,7 @@ def step_tables(chain: PersonChain, parameters: Parameters) -> StepTables:
         far,
         won,
         waits,
-        np.stack([chain.grid[front_x, front_y] == GOAL, chain.grid_after[front_x, front_y] == GOAL]),
+        np.stack([(front_x == goal_x) & (front_y == goal_y) for goal_x, goal_y in chain.goals]),
         chain.moved_at,
         chain.moves,
         chain.successors,
@@ -131,10 +131,11 @@ def _arrive(rules, tables, reached, discount, t, value, total, success, arrive):
 
 
 @entry
-def sweep_backward(rules, tables, reached, discount, policy, value, total, success):  # type: ignore[no-untyped-def]
+def sweep_backward(rules, tables, reached, discount, policy, value, total, success, kept):  # type: ignore[no-untyped-def]
     """Fill `policy` [T, P, W, C, G, L]; tables [2, P, W, C, G, L] end with t = 0 in their first half.
 
     `value` is discounted; `total` and `success` are the undiscounted return and the success of the policy.
+    `kept` [K, P, W, C, G, L] gets the values of the first K steps.
     """
     reward, bump, _, won, waits, enters, moved_at, moves, successors, at_goal = tables
     steps, people, num_waits, poses, stands, losts = policy.shape
@@ -195,6 +196,8 @@ def sweep_backward(rules, tables, reached, discount, policy, value, total, succe
                             value[now, p, w, c, g, l] = best
                             total[now, p, w, c, g, l] = u + extra[chosen]
                             success[now, p, w, c, g, l] = s
+                            if t < kept.shape[0]:
+                                kept[t, p, w, c, g, l] = best
 
 
 @entry

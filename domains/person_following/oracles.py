@@ -153,17 +153,28 @@ def full_state_optimum(
 
 
 def sweep(
-    chain: PersonChain, parameters: Parameters, discount: float
+    chain: PersonChain, parameters: Parameters, discount: float, kept: NDArray[np.float32] | None = None
 ) -> tuple[NDArray[np.int8], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Policy [T, P, W, C, G, L], and tables of which [0] is t = 0: value, undiscounted return, success."""
-    people, poses = chain.distance.shape
-    waits = 3 if parameters.look_back else 1
-    shape = (people, waits, poses, parameters.goal_patience + 2, parameters.max_lost)
+    """Policy [T, P, W, C, G, L], and tables of which [0] is t = 0: value, undiscounted return, success.
+
+    `kept` [K, P, W, C, G, L], if given, is filled with the values of the first K steps.
+    """
+    shape = state_shape(chain, parameters)
+    people, waits = shape[:2]
     rules = parameters.rules(following=True)
     reached = np.zeros((parameters.max_steps, people, waits), np.bool_)
     reachable_states(rules, chain.successors, reached)
     # Most of these entries are never touched, so they are reserved and not cleared.
     policy = np.empty((parameters.max_steps, *shape), np.int8)
     value, total, success = (np.zeros((2, *shape)) for _ in range(3))
-    sweep_backward(rules, step_tables(chain, parameters), reached, discount, policy, value, total, success)
+    if kept is None:
+        kept = np.empty((0, *shape), np.float32)
+    tables = step_tables(chain, parameters)
+    sweep_backward(rules, tables, reached, discount, policy, value, total, success, kept)
     return policy, value, total, success
+
+
+def state_shape(chain: PersonChain, parameters: Parameters) -> tuple[int, int, int, int, int]:
+    """Sizes (P, W, C, G, L) of a world's tables."""
+    people, poses = chain.distance.shape
+    return people, 3 if parameters.look_back else 1, poses, parameters.goal_patience + 2, parameters.max_lost

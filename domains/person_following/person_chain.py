@@ -41,6 +41,7 @@ class PersonChain(NamedTuple):
 
     grid: NDArray[np.uint8]  # [size, size]: at the start
     grid_after: NDArray[np.uint8]  # [size, size]: from step `moved_at` on
+    goals: NDArray[np.int64]  # [2, 2]: the person's goal, at the start and from `moved_at` on
     moved_at: int
     own: int  # number of the candidate that is the person's goal at the start
     poses: NDArray[np.int64]  # [C, 3]
@@ -91,18 +92,21 @@ def person_chains(grids: NDArray[np.uint8], parameters: Parameters) -> list[Pers
         route = np.array([p[i] for p in people[: there.index(True) + 1]], np.int64)
         moved = [t for t, grid in enumerate(grids_now) if (grid[i] != first_grids[i]).any()]
         after = grids_now[moved[0]][i] if moved else first_grids[i]
-        chains.append(_chain(first_grids[i], after, moved[0] if moved else NEVER, i % count, route, parameters))
+        ends = np.array([goals[0][i], goals[-1][i]], np.int64)
+        chains.append(chain_of(first_grids[i], after, ends, moved[0] if moved else NEVER, i % count, route, parameters))
     return chains
 
 
-def _chain(
+def chain_of(
     grid: NDArray[np.uint8],
     grid_after: NDArray[np.uint8],
+    goals: NDArray[np.int64],
     moved_at: int,
     own: int,
     route: NDArray[np.int64],
     parameters: Parameters,
 ) -> PersonChain:
+    """The chain of a person that walks a route [L + 1, 3] to its goal."""
     size, length = len(grid), len(route) - 1
     person = route.tolist()
     successors = [(k + 1, k + 1) for k in range(length)]
@@ -139,6 +143,7 @@ def _chain(
     return PersonChain(
         grid,
         grid_after,
+        goals,
         moved_at,
         own,
         poses,

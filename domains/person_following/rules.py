@@ -13,7 +13,7 @@ slices would be counted references, which cost more than the rules themselves.
 
 from __future__ import annotations
 
-from domains.core import FORWARD, GOAL, LEFT, RIGHT, STAY, WALL
+from domains.core import FORWARD, LEFT, RIGHT, STAY, WALL
 from domains.person_following.compiled import entry, inner
 from domains.person_following.paths import HEADING_ALWAYS, HEADING_NEVER, step_x, step_y
 from domains.person_following.people import move_goals, move_others, move_persons
@@ -75,7 +75,8 @@ def _move_robots(rules, world, actions, out):  # type: ignore[no-untyped-def]
                 blocked = blocked or (others[b, k, X] == x and others[b, k, Y] == y)
             if grid[b, x, y] != WALL and not blocked:
                 robot[b, X], robot[b, Y] = x, y
-                entered[b] = grid[b, x, y] == GOAL
+                # Candidates that are not the person's goal are floor like any other.
+                entered[b] = x == person[b, GOAL_X] and y == person[b, GOAL_Y]
 
 
 @inner
