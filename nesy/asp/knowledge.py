@@ -24,6 +24,7 @@ from nesy.errors import UserError
 
 if TYPE_CHECKING:
     from nesy.asp.constraints import Removal
+    from nesy.asp.explanation import Explanation
     from nesy.asp.shield import Shield
 
 
@@ -170,6 +171,8 @@ class KnowledgeBase:
             f"\n  (values less probable than {verdict.least:g} count as impossible; at most {verdict.dropped:.2g} "
             "of a row is dropped by that)"
         )
+        if not verdict.holds:
+            text += "\n" + self.explain(verdict.code, a, verdict.next_code).text
         row = {
             "holds": verdict.holds,
             "code": list(verdict.code),
@@ -246,6 +249,19 @@ class KnowledgeBase:
                 lines.append(f"{name}: may be true, may be false")
         rows = [asdict(k) for k in found.values()]
         return self._finding("What is known, what is possible?", "\n".join(lines), rows, started)
+
+    def explain(self, code: Sequence[int], action: int | str, next_code: Sequence[int] | None = None) -> Explanation:
+        """Why does an action lead from a code to the next (the most probable one by default)?
+
+        The rows behind every factor, as `.text` and as `.graph()`.
+
+        Raises:
+            UserError: a wrong code or action.
+        """
+        from nesy.asp.explanation import explain_step
+
+        later = None if next_code is None else np.asarray(next_code)
+        return explain_step(self.dbn, np.asarray(code), self.action(action), later)
 
     def shield(self, rules: Sequence[str | Path], **options: Any) -> Shield:
         """An action mask from people's rules (see nesy.asp.shield.Shield, which also lists the options).
