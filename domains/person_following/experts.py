@@ -1,0 +1,102 @@
+"""Behaviours that need no learning: random, A* expert, switching mixture, and two greedy followers.
+
+The greedy follower with the full state is `env.expert_actions("follower")`; the A* expert of the crossing task
+is `env.expert_actions("goal")`. Here are those with a memory or a mixture.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from domains.core import EMPTY, FORWARD, LEFT, RIGHT, STAY, UNSEEN, WALL, ViewGeometry
+from domains.person_following.paths import allocate_scratch, astar
+from domains.person_following.variants import Parameters
+
+_REACH = 10
+
+
+class SwitchingMixture:
+    """Random and expert play in turns: each environment switches between them with some probability."""
+
+    def __init__(self, num_envs: int, switch: float, rng: np.random.Generator) -> None:
+        """Begin with a random choice for each environment."""
+        self.switch, self.rng = switch, rng
+        self._random = rng.random(num_envs) < 0.5
+
+    def actions(self, expert: NDArray[np.int64]) -> NDArray[np.int64]:
+        """`[B]`: the expert's actions, or random ones."""
+        self._random ^= self.rng.random(len(expert)) < self.switch
+        return np.where(self._random, self.rng.integers(0, 4, len(expert)), expert)
+
+
+class LastSeenFollower:
+    """Greedy follower under partial observability: walks to the person's last seen pose, by its view alone.
+
+    It keeps that pose relative to itself by counting its own steps, plans with A* over the walls in its present
+    view, taking all else as free, and at an empty last place goes straight on, or turns left at a wall.
+    """
+
+    def __init__(self, num_envs: int, parameters: Parameters) -> None:
+        """Begin without having seen anybody."""
+        self.geometry = ViewGeometry(parameters.view_size)
+        self._rest = parameters.robot_rest
+        self._rule = parameters.compare_heading
+        self._pose = np.zeros((num_envs, 3), np.int64)
+        self._known = np.zeros(num_envs, np.bool_)
+        self._action = np.full(num_envs, STAY, np.int64)
+        self._front_free = np.zeros(num_envs, np.bool_)
+        self._time = np.zeros(num_envs, np.int64)
+        self._scratch = allocate_scratch(2 * _REACH + 1)
+
+    def actions(
+        self, observation: dict[str, NDArray[Any]], begun: NDArray[np.bool_] | None = None
+    ) -> NDArray[np.int64]:
+        """`[B]`: actions for the present observations; `begun` marks environments in a new episode."""
+        views, configurations = observation["view"], observation["configuration"]
+        if begun is not None:
+            self._known[begun] = False
+            self._action[begun] = STAY
+            self._time[begun] = 0
+        self._advance()
+        seen = configurations > 0
+        self._known |= seen
+        self._pose[seen] = self.geometry.relative(configurations[seen])
+        half, width = self.geometry.view_size // 2, self.geometry.view_size
+        occupied = seen & (self._pose[:, 0] == 0) & (self._pose[:, 1] == 1)
+        self._front_free = (views[:, half, width - 2] != WALL) & ~occupied
+        actions = np.full(len(views), STAY, np.int64)
+        for b in np.nonzero(self._known)[0]:
+            actions[b] = self._towards(views[b], self._pose[b], bool(seen[b]), bool(self._front_free[b]))
+        self._time += 1
+        resting = (self._time % self._rest == 0) if self._rest else np.zeros(len(views), np.bool_)
+        self._action = np.where(resting, STAY, actions)
+        return actions
+
+    def _advance(self) -> None:
+        """Move the remembered pose by what the robot did last."""
+        side, ahead, heading = self._pose.T.copy()
+        left, right = self._action == LEFT, self._action == RIGHT
+        went = (self._action == FORWARD) & self._front_free
+        self._pose[:, 0] = np.where(left, ahead, np.where(right, -ahead, side))
+        self._pose[:, 1] = np.where(left, -side, np.where(right, side, ahead - went))
+        self._pose[:, 2] = (heading + left - right) % 4
+
+    def _towards(self, view: NDArray[np.uint8], pose: NDArray[np.int64], seen: bool, free: bool) -> int:
+        half, width = self.geometry.view_size // 2, self.geometry.view_size
+        grid = np.full((1, 2 * _REACH + 1, 2 * _REACH + 1), EMPTY, np.uint8)
+        known = np.where(view == UNSEEN, EMPTY, view)
+        grid[0, _REACH - half : _REACH + half + 1, _REACH - width + 1 : _REACH + 1] = known
+        side, ahead, heading = (int(v) for v in pose)
+        x = min(max(_REACH + side, 0), 2 * _REACH)
+        y = min(max(_REACH - ahead, 0), 2 * _REACH)
+        compare = seen and (self._rule == "always" or (self._rule == "unless-0" and heading != 0))
+        goal_heading = heading if compare else -1
+        length = astar(grid, 0, _REACH, _REACH, 3, x, y, goal_heading, compare, self._scratch)
+        if length > 0:
+            return int(self._scratch.path[0])
+        if seen or length < 0:
+            return STAY
+        return FORWARD if free else LEFT
