@@ -30,6 +30,23 @@ def cone(dbn: TwoSliceDBN, plan: Sequence[int], factors: Sequence[int]) -> list[
     return [tuple(sorted(slice_)) for slice_ in needed]
 
 
+def reachable_values(dbn: TwoSliceDBN, code: np.ndarray, plan: Sequence[int]) -> list[tuple[np.ndarray, ...]]:
+    """Values that each factor may have after 0, 1, ..., T steps of a plan: [T + 1][N] arrays of values.
+
+    An upper bound: factors are taken as free of each other.
+    """
+    found = [tuple(np.array([int(value)]) for value in dbn._codes(code))]
+    full = np.arange(dbn.num_values)
+    for action in plan:
+        later: dict[int, np.ndarray] = {}
+        for i in dbn.order:
+            sets = [later[p] if where else found[-1][p] for where, p in dbn.parents(action, i)]
+            possible = dbn.tensor(action, i)[np.ix_(*sets, full)] > 0
+            later[i] = np.flatnonzero(possible.reshape(-1, dbn.num_values).any(axis=0))
+        found.append(tuple(later[i] for i in range(dbn.num_factors)))
+    return found
+
+
 def follow(
     dbn: TwoSliceDBN,
     code: np.ndarray,

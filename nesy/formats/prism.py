@@ -7,13 +7,14 @@ move, `action_end`, makes them the present ones. Without such arcs a step is one
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from nesy.dbn.model import TwoSliceDBN
-from nesy.dbn.plans import cone
+from nesy.dbn.plans import cone, reachable_values
 from nesy.formats.bayes_nodes import identifier
 from nesy.run_folder import atomic_path
 
@@ -43,6 +44,7 @@ def model_text(
             Without it a Markov decision process (`mdp`) in which every action is always possible.
         factors: with a plan, the factors asked for at its end: only their cone of influence is written.
     """
+    values = None if plan is None else reachable_values(dbn, start, plan)
     levels = [_levels(dbn, a) for a in range(dbn.num_actions)]
     layered = any(max(level) > 0 for level in levels)
     names = [f"x{i}" for i in range(dbn.num_factors)]
@@ -67,8 +69,9 @@ def model_text(
             for step, a in enumerate(plan):
                 guard = f"step={step} & "
                 if used is not None and step + 1 in used:
-                    context = start if step == 0 else None
-                    lines += _commands(dbn, a, i, guard, moves[a], levels[a][i], layered, context)
+                    assert values is not None
+                    possible = (values[step], values[step + 1])
+                    lines += _commands(dbn, a, i, guard, moves[a], levels[a][i], layered, possible)
                 elif layered:
                     lines += [f"  [{moves[a][levels[a][i]]}] step={step} -> true;"]
                     lines += [f"  [{moves[a][-1]}] step={step} -> ({name}'=0);"]
@@ -137,19 +140,18 @@ def _commands(
     moves: list[str],
     level: int,
     layered: bool,
-    context: np.ndarray | None,
+    possible: tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]] | None,
 ) -> list[str]:
-    """The commands of one factor under one action; with `context`, for that code of slice t alone."""
+    """The commands of one factor under one action; with `possible`, for those values of slice t and t+1 alone."""
     own = "y" if layered else "x"
     parents = dbn.parents(action, factor)
     names = [("y" if where else "x") + str(p) for where, p in parents]
-    shape = (dbn.num_values,) * len(parents)
+    full = np.arange(dbn.num_values)
+    sets = [full if possible is None else possible[where][p] for where, p in parents]
+    tensor = dbn.tensor(action, factor)
     lines = []
-    for values, row in zip(np.ndindex(*shape), dbn.cpt(action, factor), strict=True):
-        if context is not None and any(
-            where == 0 and context[p] != value for (where, p), value in zip(parents, values, strict=True)
-        ):
-            continue
+    for values in itertools.product(*(column.tolist() for column in sets)):
+        row = tensor[values]
         when = guard + (" & ".join(f"{n}={v}" for n, v in zip(names, values, strict=True)) or "true")
         then = " + ".join(f"{p!r}:({own}{factor}'={k})" for k, p in enumerate(row.tolist()) if p > 0)
         lines.append(f"  [{moves[level]}] {when} -> {then};")
