@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from domains.core import OUTCOMES, ViewGeometry
+from domains.core import OUTCOMES, DomainError, ViewGeometry
 from domains.person_following.batch import NUM_ACTIONS, Batch, checked_actions, checked_task, observation_space
 from domains.person_following.random_numbers import stream_of, write_back
 from domains.person_following.variants import parameters_of
+
+if TYPE_CHECKING:
+    from domains.person_following.render import Window
 
 
 class PersonFollowingEnv(gymnasium.Env):
@@ -22,7 +25,7 @@ class PersonFollowingEnv(gymnasium.Env):
     0 where the person is unseen. Actions: left, right, forward, stay.
     """
 
-    metadata: dict[str, Any] = {"render_modes": [], "render_fps": 6}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 6}  # noqa: RUF012
 
     def __init__(
         self,
@@ -37,7 +40,10 @@ class PersonFollowingEnv(gymnasium.Env):
         self.batch = Batch(task, 1, parameters_of(variant, checked_task(task), **parameters), maps, cycle)
         self.observation_space = observation_space(self.batch.geometry)
         self.action_space = spaces.Discrete(NUM_ACTIONS)
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise DomainError(f"unknown render_mode '{render_mode}': known are rgb_array, human")
         self.render_mode = render_mode
+        self._window: Window | None = None
         self._actions = np.zeros(1, np.int64)
 
     @property
@@ -68,6 +74,8 @@ class PersonFollowingEnv(gymnasium.Env):
         write_back(batch.world.stream[0], self.np_random)
         last = batch.last
         observation = {"view": last.robot_view[0].copy(), "configuration": last.configuration[0]}
+        if self.render_mode == "human":
+            self.render()
         return observation, {"distance": int(last.distance[0]), "visible": bool(last.configuration[0] > 0)}
 
     def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
@@ -92,7 +100,30 @@ class PersonFollowingEnv(gymnasium.Env):
         if terminated or truncated:
             info["outcome"] = OUTCOMES[last.outcome[0]]
         observation = {"view": last.robot_view[0], "configuration": last.configuration[0]}
+        if self.render_mode == "human":
+            self.render()
         return observation, float(last.reward[0]), terminated, truncated, info
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """A picture uint8 [height, width, 3] in mode `rgb_array`; in mode `human` it is shown in a window."""
+        if self.render_mode is None:
+            return None
+        from domains.person_following.render import Window, render_state
+
+        following = self.batch.task == "following"
+        picture = render_state(self.state(), self.batch.last.robot_view[0], person=following)
+        if self.render_mode == "rgb_array":
+            return picture
+        if self._window is None:
+            self._window = Window(self.metadata["render_fps"], f"nesy: {self.batch.task}")
+        self._window.show(picture)
+        return None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
 
     def state(self) -> dict[str, Any]:
         """The full state: grid, agent, person, goal, waiting, lost, t; plain numbers and a copy of the grid."""

@@ -17,7 +17,7 @@ IDS = ("nesy/PersonFollowing-v0", "nesy/Crossing-v0")
 
 @pytest.mark.parametrize("name", IDS)
 def test_gymnasium_checker_passes(name):
-    check_env(gymnasium.make(name).unwrapped, skip_render_check=True)
+    check_env(gymnasium.make(name, render_mode="rgb_array").unwrapped)
 
 
 def test_same_seed_same_episodes():
