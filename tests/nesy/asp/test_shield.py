@@ -123,3 +123,34 @@ def test_the_knowledge_base_makes_shields():
         [True, False],
         [True, True],
     ]
+
+
+def test_no_forbidden_action_is_taken_in_the_real_environment():
+    from domains.core import load_domain
+
+    domain = load_domain("person_following")
+    predicates = domain.predicates
+    shield = Shield(
+        ["forbidden(forward) :- now(wall_ahead). forbidden(forward) :- now(person_ahead)."],
+        domain.spec.action_names,
+        8,
+        8,
+        predicates.names,
+        fallback="stay",
+    )
+    columns = [predicates.names.index(name) for name in shield.predicates]
+    environment = domain.make("following", 64, seed=0)
+    observation, _ = environment.reset(seed=0)
+    rng = np.random.default_rng(0)
+    forward = blocked = 0
+    for _ in range(100):
+        views, places = observation["view"], observation["configuration"]
+        truth = predicates.evaluate(views)[:, columns]
+        mask = shield.mask(np.zeros((64, 8), dtype=np.uint8), truth, places)
+        actions = np.where(mask[:, 2], 2, rng.integers(0, 2, size=64))
+        ahead = (views[:, 2, 3] == 1) | ((places > 0) & ((places - 1) // 4 == 2 * 5 + 3))
+        assert not (ahead & (actions == 2)).any()
+        forward += int((actions == 2).sum())
+        blocked += int(ahead.sum())
+        observation = environment.step(actions)[0]
+    assert forward > 500 and blocked > 500
