@@ -68,6 +68,7 @@ def extract(
     *,
     action_names: Sequence[str] | None = None,
     factor_names: Sequence[str] | None = None,
+    weights: np.ndarray | None = None,
     initial_codes: np.ndarray | None = None,
     meanings: Sequence[Sequence[str]] = (),
     provenance: dict[str, Any] | None = None,
@@ -81,6 +82,7 @@ def extract(
         next_codes: uint8 [n, N].
         action_names: A names.
         factor_names: N names; `X0`, `X1`, ... by default.
+        weights: int64 [n], how often each transition was met; once each by default.
         initial_codes: uint8 [m, N], codes at the start of episodes; the initial distribution is theirs.
         meanings: [N][K] texts.
         provenance: where the model comes from, JSON values.
@@ -104,27 +106,35 @@ def extract(
         value_meanings=meanings,
         provenance=provenance,
     )
-    return with_counts(dbn, codes, actions, next_codes)
+    return with_counts(dbn, codes, actions, next_codes, weights)
 
 
-def with_counts(dbn: TwoSliceDBN, codes: np.ndarray, actions: np.ndarray, next_codes: np.ndarray) -> TwoSliceDBN:
+def with_counts(
+    dbn: TwoSliceDBN,
+    codes: np.ndarray,
+    actions: np.ndarray,
+    next_codes: np.ndarray,
+    weights: np.ndarray | None = None,
+) -> TwoSliceDBN:
     """The same model with the number of the given transitions behind every row.
 
     Also sets the tables `codes` uint8 [C, N], the distinct codes met, `taken` int64 [A], how often each action was
     taken, and `changed` int64 [A, N], in how many of its transitions each factor changed its value.
     """
+    weights = np.ones(len(codes), dtype=np.int64) if weights is None else np.asarray(weights, dtype=np.int64)
     counts = np.zeros(len(dbn.probabilities), dtype=np.int64)
     taken = np.zeros(dbn.num_actions, dtype=np.int64)
     changed = np.zeros((dbn.num_actions, dbn.num_factors), dtype=np.int64)
     for a in range(dbn.num_actions):
         chosen = np.asarray(actions) == a
-        taken[a] = chosen.sum()
-        changed[a] = (codes[chosen] != next_codes[chosen]).sum(axis=0)
-        now, later = codes[chosen].astype(np.int64), next_codes[chosen].astype(np.int64)
+        now, later, often = codes[chosen].astype(np.int64), next_codes[chosen].astype(np.int64), weights[chosen]
+        taken[a] = often.sum()
+        changed[a] = often @ (now != later)
         for i in range(dbn.num_factors):
             start = dbn.offsets[a, i]
             rows = dbn.num_rows(a, i)
-            counts[start : start + rows] = np.bincount(dbn.rows(a, i, now, later), minlength=rows)
+            # weights are far below 2^53, so the floats that bincount adds up are exact
+            counts[start : start + rows] = np.bincount(dbn.rows(a, i, now, later), weights=often, minlength=rows)
     every = np.concatenate([codes, next_codes]).astype(np.uint8)
     met = every[unique_rows(every)[0]]
     tables = {**dbn.tables, "codes": met, "taken": taken, "changed": changed}
@@ -171,7 +181,8 @@ def extract_run(run: RunFolder, domain_name: str) -> dict[str, Any]:
     }
     taken = (transitions.codes, transitions.actions, transitions.next_codes)
     if isinstance(model, Conditionals):
-        dbn = extract(model, *taken, **described)
+        *distinct, weights = transitions.distinct()
+        dbn = extract(model, *distinct, weights=weights, **described)
     else:
         from nesy.dbn.fitting import from_callable
 
@@ -209,6 +220,16 @@ class Transitions:
         self.codes = self.view_codes[self.view_index]
         self.next_codes = self.view_codes[self.next_view_index]
         self.actions = np.asarray(actions, dtype=np.int64)
+
+    def distinct(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Distinct transitions: codes uint8 [n, N], actions int64 [n], next codes uint8 [n, N], counts int64 [n]."""
+        first, code_of_view, _ = unique_rows(self.view_codes)
+        codes, number = self.view_codes[first], len(first)
+        base = int(self.actions.max(initial=0)) + 1
+        key = (code_of_view[self.view_index] * base + self.actions) * number + code_of_view[self.next_view_index]
+        kinds, counts = np.unique(key, return_counts=True)
+        before, after = kinds // number, kinds % number
+        return codes[before // base], before % base, codes[after], counts
 
 
 def encode(experience: Any, codec: Any) -> Transitions:

@@ -44,8 +44,9 @@ def fidelity(dbn: TwoSliceDBN, model: Conditionals | Marginals | None, transitio
         "codes_met": len(np.unique(transitions.view_codes, axis=0)),
         "views_met": len(transitions.views),
     }
-    figures |= nll(dbn, transitions.codes, transitions.actions, transitions.next_codes)
-    figures |= row_differences(dbn, transitions.codes, transitions.actions, transitions.next_codes)
+    taken = transitions.distinct()
+    figures |= nll(dbn, *taken)
+    figures |= row_differences(dbn, *taken)
     figures["unknown_code_rate"] = unknown_code_rate(dbn, np.unique(transitions.view_codes, axis=0))
     if isinstance(model, Conditionals):
         figures["max_difference_to_network"] = max_difference(dbn, model)
@@ -73,7 +74,9 @@ def max_difference(dbn: TwoSliceDBN, model: Conditionals) -> float:
     )
 
 
-def nll(dbn: TwoSliceDBN, codes: np.ndarray, actions: np.ndarray, next_codes: np.ndarray) -> dict[str, float]:
+def nll(
+    dbn: TwoSliceDBN, codes: np.ndarray, actions: np.ndarray, next_codes: np.ndarray, counts: np.ndarray
+) -> dict[str, float]:
     """Mean negative log-likelihood of some transitions, and the least that any model can have on them.
 
     Args:
@@ -81,13 +84,12 @@ def nll(dbn: TwoSliceDBN, codes: np.ndarray, actions: np.ndarray, next_codes: np
         codes: uint8 [n, N].
         actions: int64 [n].
         next_codes: uint8 [n, N].
+        counts: int64 [n], how often each was met; the transitions are distinct.
 
     Returns:
         `nll`, `nll_limit` (nats) and `impossible` (share of transitions with probability below 1e-12).
     """
-    every = np.column_stack([codes, actions, next_codes]).astype(np.uint8)
-    first, _, counts = unique_rows(every)
-    kinds = every[first]
+    kinds = np.column_stack([codes, actions, next_codes]).astype(np.uint8)
     n = dbn.num_factors
     logs = dbn.log_prob(kinds[:, :n], kinds[:, n], kinds[:, n + 1 :])
     weights = counts / counts.sum()
@@ -101,9 +103,9 @@ def nll(dbn: TwoSliceDBN, codes: np.ndarray, actions: np.ndarray, next_codes: np
 
 
 def row_differences(
-    dbn: TwoSliceDBN, codes: np.ndarray, actions: np.ndarray, next_codes: np.ndarray
+    dbn: TwoSliceDBN, codes: np.ndarray, actions: np.ndarray, next_codes: np.ndarray, weights: np.ndarray
 ) -> dict[str, float]:
-    """How far the rows are from the frequencies in some transitions, weighted by visits.
+    """How far the rows are from the frequencies in some transitions (met `weights` times each).
 
     Returns:
         `row_tv` and `row_kl` (KL from frequencies to row, nats; probabilities below 1e-12 count as 1e-12).
@@ -115,13 +117,14 @@ def row_differences(
         now, later = codes[chosen].astype(np.int64), next_codes[chosen].astype(np.int64)
         for i in range(dbn.num_factors):
             cell = dbn.rows(a, i, now, later) * k + later[:, i]
-            counts = np.bincount(cell, minlength=dbn.num_rows(a, i) * k).reshape(-1, k)
+            # only rows met are looked at: tables are large, and most of their rows are never met
+            rows, index = np.unique(cell // k, return_inverse=True)
+            counts = np.bincount(index.reshape(-1) * k + cell % k, weights[chosen], len(rows) * k).reshape(-1, k)
             visits = counts.sum(axis=1)
-            met = visits > 0
-            row, frequency = dbn.cpt(a, i)[met], counts[met] / visits[met, None]
+            row, frequency = dbn.cpt(a, i)[rows], counts / visits[:, None]
             logs = np.log(np.where(frequency > 0, frequency, 1.0)) - np.log(np.maximum(row, FLOOR))
-            distance += float((visits[met] * 0.5 * np.abs(frequency - row).sum(axis=1)).sum())
-            divergence += float((visits[met, None] * frequency * logs).sum())
+            distance += float((visits * 0.5 * np.abs(frequency - row).sum(axis=1)).sum())
+            divergence += float((visits[:, None] * frequency * logs).sum())
             total += float(visits.sum())
     return {"row_tv": distance / max(total, 1.0), "row_kl": max(0.0, divergence / max(total, 1.0))}
 

@@ -100,6 +100,12 @@ class _Transitions:
         self.view_codes = np.unique(codes, axis=0)
         self.views = np.zeros((len(self.view_codes), 1, 1), dtype=np.uint8)
 
+    def distinct(self):
+        kinds = np.column_stack([self.codes, self.actions, self.next_codes]).astype(np.uint8)
+        kinds, counts = np.unique(kinds, axis=0, return_counts=True)
+        n = self.codes.shape[1]
+        return kinds[:, :n], kinds[:, n].astype(np.int64), kinds[:, n + 1 :], counts
+
 
 @pytest.mark.parametrize("score", ["bic", "aic"])
 def test_other_scores_work_and_unknown_ones_are_refused(score):
@@ -166,3 +172,17 @@ def test_distinct_rows_are_numpy_s(width):
         np.testing.assert_array_equal(counts, wanted_counts)
     else:
         assert counts.tolist() == [300]
+
+
+def test_distinct_transitions_stand_for_all():
+    from nesy.dbn.extraction import with_counts
+
+    taken = experience()
+    codes, actions, later, counts = taken.distinct()
+    assert counts.sum() == len(taken.codes) and len(counts) == 16
+    dbn = toy()[0]
+    whole = with_counts(dbn, taken.codes, taken.actions, taken.next_codes)
+    short = with_counts(dbn, codes, actions, later, counts)
+    np.testing.assert_array_equal(whole.row_counts, short.row_counts)
+    for name in ("codes", "taken", "changed"):
+        np.testing.assert_array_equal(whole.tables[name], short.tables[name])
