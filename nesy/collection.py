@@ -118,6 +118,43 @@ def collect(
     return rows
 
 
+def collect_following(
+    domain: Domain,
+    episodes: int,
+    mixture: float,
+    folder: Path | str,
+    seed: int = 0,
+    progress: Progress = SILENT,
+    *,
+    variant: str = "paper",
+) -> int:
+    """Collect what is still missing of `episodes` more person-following episodes that switch behaviour.
+
+    For who needs to know the person better than the world: a planner's tables. Arguments as in `collect`;
+    `mixture` is the probability that the switching behaviour acts at random.
+
+    Returns:
+        The number of rows in all shards.
+    """
+    folder = Path(folder)
+    config = CollectConfig(crossing_episodes=0, following_episodes=episodes, following_mixture=mixture)
+    rows, done = 0, 0
+    with progress.task("collecting practice", episodes) as task:
+        while done < episodes:
+            size = min(config.shard_episodes, episodes - done)
+            # Numbered from 10,000: other random streams than the shards of `collect`.
+            index = done // config.shard_episodes
+            shard = Shard(index, "following-mixture", 10_000 + index, done, size)
+            finished = count_rows(folder / shard.name)
+            if finished is None:
+                finished = _collect_shard(domain, variant, config, shard, folder / shard.name, seed, task)
+            else:
+                task.advance(size)
+            rows += finished
+            done += size
+    return rows
+
+
 def _collect_shard(
     domain: Domain, variant: str, config: CollectConfig, shard: Shard, path: Path, seed: int, task: Task
 ) -> int:

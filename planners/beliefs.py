@@ -119,10 +119,10 @@ class ParticleBelief:
         return (codes[:, :, None] == np.arange(self.model.num_values)).mean(axis=0)
 
     def _draw_codes(self, prior: np.ndarray, count: int) -> np.ndarray:
-        cumulative = np.cumsum(np.asarray(prior, np.float64), axis=1)
-        cumulative /= cumulative[:, -1:]
-        numbers = self.rng.random((count, self.model.num_factors))
-        return (numbers[:, :, None] >= cumulative[None, :, :-1]).sum(axis=2).astype(np.int16)
+        """Person's codes drawn from the prior, among the known ones: int16 [count, N]."""
+        cumulative = np.cumsum(self.model.code_chances(prior))
+        chosen = np.searchsorted(cumulative, self.rng.random(count) * cumulative[-1], side="right")
+        return self.model.known_codes[np.minimum(chosen, len(cumulative) - 1)].astype(np.int16)
 
     def _restart(self, action: int, code: np.ndarray, pose: np.ndarray | None, prior: np.ndarray) -> None:
         """The fallback: keep the counters, take x and (if seen) c from the observation and y from the prior."""

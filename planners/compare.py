@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -21,9 +22,9 @@ import pyarrow.parquet as pq
 from domains.core import Domain, DomainError, OracleResult, load_domain
 from nesy.errors import UserError
 from nesy.progress import SILENT, Progress
-from nesy.run_folder import RunFolder, atomic_path
+from nesy.run_folder import RunFolder, atomic_path, read_json
 from planners import config as settings
-from planners.config import CompareConfig
+from planners.config import CompareConfig, SearchConfig
 from planners.evaluation import Columns, evaluate, outcome_names
 from planners.statistics import Interval, bootstrap
 
@@ -108,7 +109,9 @@ def compare(
     from planners.engines import run_cells
 
     cells = grid(config)
-    ensure_ialm(run)
+    domain = load_domain(domain_name)
+    if any(cell.agent in settings.PLANNING_AGENTS for cell in cells):
+        ensure_ialm(run, domain, config.variants[0], config.search, seed, progress)
     missing = [cell for cell in cells if not _is_done(run, config, cell, seed)]
     total = sum(_episodes(config, cell) for cell in missing)
     with progress.task("compare", total) as task:
@@ -117,25 +120,42 @@ def compare(
     tables = [pq.read_table(_path(run, cell)) for cell in cells]
     with atomic_path(run.results / "episodes.parquet") as temporary:
         pq.write_table(pa.concat_tables(tables).replace_schema_metadata(None), temporary, compression="zstd")
-    oracles = {variant: _oracle(load_domain(domain_name), variant) for variant in config.variants}
+    oracles = {variant: _oracle(domain, variant) for variant in config.variants}
     return summarise(cells, tables, config, oracles)
 
 
-def ensure_ialm(run: RunFolder) -> None:
-    """Learn the planner's model unless the run already holds it."""
-    if (run.ialm / "model.json").is_file():
+def ensure_ialm(
+    run: RunFolder, domain: Domain, variant: str, config: SearchConfig, seed: int, progress: Progress = SILENT
+) -> None:
+    """Learn the planner's model, from the run's experience and practice of its own, unless the run holds it."""
+    provenance = {
+        "variant": variant,
+        "seed": seed,
+        "practice_episodes": config.practice_episodes,
+        "practice_mixture": config.practice_mixture,
+        "discount": config.discount,
+    }
+    path = run.ialm / "model.json"
+    if path.is_file() and read_json(path).get("provenance") == provenance:
         return
+    from nesy.collection import collect_following
     from nesy.dbn import TwoSliceDBN
     from nesy.experience import Experience
     from nesy.world_model import SymbolicCodec, load_world_model
-    from planners.ialm import learn
+    from planners.ialm_learning import joined, learn_ialm
 
-    learn(
-        TwoSliceDBN.load(run.dbn),
-        SymbolicCodec(load_world_model(run.world_model)),
-        Experience.load(run.experience),
-        run.ialm,
-    )
+    experience = Experience.load(run.experience)
+    if config.practice_episodes:
+        folder = run.ialm / "practice"
+        if path.is_file():
+            shutil.rmtree(folder, ignore_errors=True)  # of other settings
+        collect_following(
+            domain, config.practice_episodes, config.practice_mixture, folder, seed, progress, variant=variant
+        )
+        experience = joined(experience, Experience.load(folder))
+    codec = SymbolicCodec(load_world_model(run.world_model))
+    model = learn_ialm(TwoSliceDBN.load(run.dbn), codec, experience, provenance, config.discount)
+    model.save(run.ialm)
 
 
 def run_cell(

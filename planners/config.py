@@ -106,7 +106,7 @@ class DQNConfig:
 class SearchConfig:
     """How the planners search."""
 
-    simulations: int = 300
+    simulations: int = 1000
     """Simulations per decision."""
     time_limit: float = 0.0
     """Seconds per decision after which the search stops early; 0 for no limit (and repeatable results)."""
@@ -118,6 +118,10 @@ class SearchConfig:
     """Weight of the exploration term (UCB1), in units of reward."""
     particles: int = 400
     """Particles of the belief over (x, y, c, counters)."""
+    practice_episodes: int = 12_000
+    """Person-following episodes, besides the run's experience, that the planner's tables are learned from."""
+    practice_mixture: float = 0.3
+    """Probability that the switching behaviour of these episodes acts at random."""
     pomdp_py_simulations: int = 60
     """Simulations per decision of pomdp-py's POUCT, which is far slower per simulation."""
 

@@ -112,6 +112,7 @@ class IALM:
         dbn: the extracted 2DBN that drives x and y.
         motion: how the relative pose c changes.
         tables: one `DecisionTable` per name in `TABLES`.
+        known_codes: uint8 [V, N], the codes that experience holds; what is not among them is no view at all.
         initial_poses: int16 [M, 3] relative poses at the start of episodes, with `initial_pose_counts` [M].
         leaf_values: float64 [2W + 1, 2W + 1, 4, L], see planners.bounds.
         initial_waiting: counts [W] of the waiting counter at the start of episodes.
@@ -122,6 +123,7 @@ class IALM:
     dbn: TwoSliceDBN
     motion: RelativeMotion
     tables: dict[str, DecisionTable]
+    known_codes: np.ndarray
     initial_poses: np.ndarray
     initial_pose_counts: np.ndarray
     initial_waiting: np.ndarray
@@ -190,6 +192,25 @@ class IALM:
         variables[:, 2 * self.num_factors :] = codes
         return table.estimates()[table.locate(variables)]
 
+    def code_chances(self, prior: np.ndarray, floor: float = 0.02) -> np.ndarray:
+        """P(y) over the known codes when each factor is believed as `prior` says.
+
+        Factors are believed one by one, but their values come together: of the products of values that `prior`
+        allows only the known codes are views. Each factor keeps `floor` for all its values, so that a prior which
+        fits no known code still prefers the codes that it fits best.
+
+        Args:
+            prior: float [N, K].
+            floor: in (0, 1].
+
+        Returns:
+            float64 [V], sums to 1.
+        """
+        floored = (1 - floor) * np.asarray(prior, np.float64) + floor / self.num_values
+        logarithms = np.log(floored)[np.arange(self.num_factors), self.known_codes].sum(axis=1)
+        chances = np.exp(logarithms - logarithms.max())
+        return np.asarray(chances / chances.sum())
+
     def describe(self) -> list[dict[str, Any]]:
         """One record per table: name, rows, parents, examples."""
         return [
@@ -208,6 +229,7 @@ class IALM:
         arrays: dict[str, np.ndarray] = {f"motion.{name}": array for name, array in self.motion.arrays().items()}
         for name, table in self.tables.items():
             arrays |= {f"{name}.{part}": getattr(table, part) for part in _TABLE_ARRAYS}
+        arrays["codes"] = self.known_codes
         arrays["initial.poses"] = self.initial_poses
         arrays["initial.pose_counts"] = self.initial_pose_counts
         arrays["initial.waiting"] = self.initial_waiting
@@ -273,6 +295,7 @@ class IALM:
                 dbn=dbn,
                 motion=motion,
                 tables=tables,
+                known_codes=arrays["codes"],
                 initial_poses=arrays["initial.poses"],
                 initial_pose_counts=arrays["initial.pose_counts"],
                 initial_waiting=arrays["initial.waiting"],

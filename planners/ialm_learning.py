@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from planners.tables import DecisionTable, Parents, learn_distribution, learn_me
 if TYPE_CHECKING:
     from nesy.experience import Experience
 
+_MOST_CROSSING = 120_000  # steps of crossing that are looked at: the views of a task repeat soon
 _ORDERED = {"side", "ahead", "waiting", "lost", "distance"}
 
 
@@ -37,6 +39,7 @@ def learn_ialm(
         discount: per step, for the leaf values.
     """
     following = experience.select(np.char.startswith(experience.source, "following"))
+    crossing = _some_crossing(experience)
     if len(following) == 0:
         raise UserError("the experience holds no person-following episodes; collect some (sources following-*)")
     motion, moved = learn_motion(following)
@@ -74,9 +77,9 @@ def learn_ialm(
     estimated = lost_table.estimates()[lost_table.locate(variables[ended])].argmax(axis=1)
     variables[ended, 3 * n + ialm.NEXT_LOST_COUNT] = estimated
     tables = {
-        "moved": learn_distribution(variables[forward], parents("x", "c"), moved[forward].astype(np.int64), 2),
+        "moved": _learn_moved(codec, crossing, variables[forward], moved[forward], parents("x", "c")),
         "waits": learn_distribution(variables, parents("mid", "next_x", "waiting"), waited.astype(np.int64), 2),
-        "influence": _learn_influence(dbn, codec, experience, parents("y")),
+        "influence": _learn_influence(dbn, codec, experience, following, parents("y")),
         "next_waiting": learn_distribution(
             variables[followed], parents("waiting", "person"), next_waiting[followed], int(next_waiting.max()) + 1
         ),
@@ -105,6 +108,7 @@ def learn_ialm(
         dbn=dbn,
         motion=motion,
         tables=tables,
+        known_codes=_known_codes(codec, crossing, following),
         initial_poses=poses.astype(np.int16),
         initial_pose_counts=counts.astype(np.int64),
         initial_waiting=np.bincount(following.waiting[first].clip(0)).astype(np.int64),
@@ -112,6 +116,26 @@ def learn_ialm(
         view_size=int(following.view.shape[-1]),
         provenance=dict(provenance or {}),
     )
+
+
+def joined(first: Experience, second: Experience) -> Experience:
+    """The rows of both; episodes of the second are renumbered to follow those of the first."""
+    columns = {field.name: (getattr(first, field.name), getattr(second, field.name)) for field in fields(first)}
+    shift = first.episode.max(initial=-1) + 1
+    columns["episode"] = (first.episode, second.episode + shift)
+    return type(first)(**{name: np.concatenate(pair) for name, pair in columns.items()})
+
+
+def _some_crossing(experience: Experience) -> Experience:
+    """Steps of the crossing task, at most `_MOST_CROSSING`, evenly spread."""
+    rows = np.flatnonzero(np.char.startswith(experience.source, "crossing"))
+    return experience.select(rows[:: max(1, -(-len(rows) // _MOST_CROSSING))])
+
+
+def _known_codes(codec: Codec, crossing: Experience, following: Experience) -> np.ndarray:
+    """The distinct codes of robots and of persons: uint8 [V, N]."""
+    views = np.concatenate([crossing.view, following.view, following.next_view, following.person_view])
+    return np.unique(codec.codes(views), axis=0)
 
 
 def _slot_names(num_factors: int) -> list[str]:
@@ -165,6 +189,32 @@ def _next_counters(experience: Experience) -> tuple[np.ndarray, np.ndarray, np.n
     return followed, np.where(followed, waiting, 0), np.where(followed, lost, 0)
 
 
+def _learn_moved(
+    codec: Codec, crossing: Experience, variables: np.ndarray, moved: np.ndarray, parents: Parents
+) -> DecisionTable:
+    """P(moved | x, c) from following, where c shows it, and from crossing, where the view does.
+
+    A view may look the same after a move, so one unchanged view proves nothing; a code from which `forward` never
+    changed the view is one from which it does not move. Nobody is met in crossing: c is set to the farthest pose.
+    """
+    crossing = crossing.select(crossing.action == FORWARD)
+    if len(crossing) == 0:
+        return learn_distribution(variables, parents, moved.astype(np.int64), 2)
+    codes = codec.codes(crossing.view)
+    changed = (crossing.view != crossing.next_view).reshape(len(crossing), -1).any(axis=1)
+    distinct, group, counts = np.unique(codes, axis=0, return_inverse=True, return_counts=True)
+    ever = np.bincount(group.reshape(-1), changed) > 0
+    alone = np.zeros((len(distinct), variables.shape[1]), np.int32)
+    alone[:, : codes.shape[1]] = distinct
+    return learn_distribution(
+        np.concatenate([variables, alone]),
+        parents,
+        np.concatenate([moved, ever]).astype(np.int64),
+        2,
+        np.concatenate([np.ones(len(moved)), counts]),
+    )
+
+
 def _leaf_values(motion: RelativeMotion, scalars: np.ndarray, experience: Experience, discount: float) -> np.ndarray:
     """The relational part of the experience, solved (planners.bounds)."""
     next_pose = scalars[:, ialm.NEXT_SIDE : ialm.NEXT_SIDE + 3]
@@ -185,7 +235,9 @@ def _leaf_values(motion: RelativeMotion, scalars: np.ndarray, experience: Experi
     )
 
 
-def _learn_influence(dbn: TwoSliceDBN, codec: Codec, experience: Experience, parents: Parents) -> DecisionTable:
+def _learn_influence(
+    dbn: TwoSliceDBN, codec: Codec, experience: Experience, following: Experience, parents: Parents
+) -> DecisionTable:
     """pi(u | y) from whoever walks towards a goal by what it sees: the crossing expert, and persons followed."""
     expert = experience.select(experience.source == "crossing-expert")
     person = experience.select(
