@@ -1,15 +1,21 @@
-"""Ask what factors and values mean, or run any ASP program over the model of a run.
+"""Ask what factors and values mean, verify, plan, explain; or run any ASP program over the model of a run.
 
-Ready questions:
+Ready questions, one per call:
   --means 3=5             what does factor 3 = value 5 mean?
   --changes forward       which factors does the action change, and through which parents?
   --predicate wall_ahead  which values mean that the predicate holds?
+  --when wall_ahead       which rules over values say when it holds, and how well on views not used for them?
+  --verify forward --premise wall_ahead --conclusion same     does this follow, over ALL codes?
+  --plan goal_ahead --start 17        the shortest plan from a view (by number) or a code (3,0,...) to a goal
+  --after left forward --start 17     what must, can and cannot hold after these actions?
+  --explain forward --start 17        why does the action lead where it most probably leads?
   --vocabulary            which predicates and facts are there?
 Your own: --program FILE (any ASP program over the facts), with --rules FILE ... as background knowledge.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -30,11 +36,27 @@ class Arguments:
     run: Path = Path("runs/default")
     """The run folder."""
     means: str | None = None
-    """FACTOR=VALUE: what the value means, in predicates and as a picture in characters."""
+    """FACTOR=VALUE: what the value means, in predicates."""
     changes: str | None = None
     """An action: which factors it changes, and which parents decide it."""
     predicate: str | None = None
     """A predicate: which values of which factors mean that it holds."""
+    when: str | None = None
+    """A predicate: the rules over values that say when it holds, with precision and recall."""
+    verify: str | None = None
+    """An action: whether --conclusion holds after every possible step of it from a code with --premise."""
+    premise: str = ""
+    """Conditions before the step, comma-separated: X3=5, X3!=5, a predicate, not a predicate."""
+    conclusion: str = "same"
+    """Conditions after the step, likewise; `same`: the code stays as it is."""
+    plan: str | None = None
+    """Conditions of a goal: the shortest plan of most probable outcomes to it from --start."""
+    after: tuple[str, ...] = ()
+    """Actions: what must, can and cannot hold after them from --start."""
+    explain: str | None = None
+    """An action: the rows behind its most probable outcome from --start."""
+    start: str = "0"
+    """Where plans start: the number of a view (as in the fact view(I)), or a code such as 3,0,1,7,2,2,5,4."""
     vocabulary: bool = False
     """List the predicates and the facts that programs can use."""
     program: Path | None = None
@@ -51,31 +73,51 @@ class Arguments:
 
 def run(options: Arguments) -> dict[str, Any]:
     """Answer one question."""
-    asked = [name for name in ("means", "changes", "predicate", "program") if getattr(options, name) is not None] + [
-        "vocabulary"
-    ] * options.vocabulary
+    asked = [name for name in QUESTIONS if getattr(options, name) not in (None, False, ())]
     if len(asked) != 1:
-        raise UserError(
-            "ask one question: --means F=V, --changes ACTION, --predicate NAME, --vocabulary or --program FILE"
-            + (f" (found {', '.join('--' + name for name in asked)})" if asked else "")
-        )
+        names = ", ".join("--" + name for name in QUESTIONS)
+        found = f" (found {', '.join('--' + name for name in asked)})" if asked else ""
+        raise UserError(f"ask one question: {names}{found}")
     run_folder = RunFolder.open(options.run)
     run_folder.require("extract")
     from nesy.asp import KnowledgeBase
 
-    knowledge = KnowledgeBase.from_run(run_folder.path)
-    if options.means is not None:
-        factor, value = _factor_and_value(options.means)
-        return knowledge.means(factor, value).to_dict()
-    if options.changes is not None:
-        return knowledge.influenced(options.changes).to_dict()
-    if options.predicate is not None:
-        return knowledge.implies(options.predicate).to_dict()
-    if options.vocabulary:
-        return _vocabulary(knowledge)
+    return QUESTIONS[asked[0]](KnowledgeBase.from_run(run_folder.path), options)
+
+
+def _means(knowledge: KnowledgeBase, options: Arguments) -> dict[str, Any]:
+    assert options.means is not None
+    factor, value = _factor_and_value(options.means)
+    return knowledge.means(factor, value).to_dict()
+
+
+def _explain(knowledge: KnowledgeBase, options: Arguments) -> dict[str, Any]:
+    assert options.explain is not None
+    explanation = knowledge.explain(_start(knowledge, options.start), options.explain)
+    return {"question": f"Why does {options.explain} lead there?", "text": explanation.text}
+
+
+def _program(knowledge: KnowledgeBase, options: Arguments) -> dict[str, Any]:
     assert options.program is not None
     answer = knowledge.query(options.program, rules=options.rules, models=options.models, time_limit=options.time_limit)
     return {**answer.to_dict(), "text": _answer_text(answer)}
+
+
+def _start(knowledge: KnowledgeBase, text: str) -> list[int]:
+    """The code that --start names.
+
+    Raises:
+        UserError: neither the number of a view met in experience nor a code.
+    """
+    parts = [part.strip() for part in text.split(",")]
+    if not all(part.isdecimal() for part in parts):
+        raise UserError(f"--start {text}: expected the number of a view, or a code of comma-separated values")
+    if len(parts) > 1:
+        return [int(part) for part in parts]
+    views = 0 if knowledge.codebook is None else len(knowledge.codebook)
+    if knowledge.codebook is None or int(text) >= views:
+        raise UserError(f"--start {text}: no such view; the model's views are 0 to {views - 1}")
+    return [int(value) for value in knowledge.codebook.codes[int(text)]]
 
 
 def _vocabulary(knowledge: KnowledgeBase) -> dict[str, Any]:
@@ -116,6 +158,22 @@ def _factor_and_value(text: str) -> tuple[int, int]:
     if not equals or not factor.strip().isdecimal() or not value.strip().isdecimal():
         raise UserError(f"--means {text}: expected FACTOR=VALUE, two numbers such as 3=5")
     return int(factor), int(value)
+
+
+QUESTIONS: dict[str, Callable[[KnowledgeBase, Arguments], dict[str, Any]]] = {
+    "means": _means,
+    "changes": lambda knowledge, options: knowledge.influenced(options.changes or "").to_dict(),
+    "predicate": lambda knowledge, options: knowledge.implies(options.predicate or "").to_dict(),
+    "when": lambda knowledge, options: knowledge.rules(options.when or "").to_dict(),
+    "verify": lambda knowledge, options: knowledge.verify(
+        options.verify or "", options.premise, options.conclusion
+    ).to_dict(),
+    "plan": lambda knowledge, options: knowledge.plan(_start(knowledge, options.start), options.plan or "").to_dict(),
+    "after": lambda knowledge, options: knowledge.after(_start(knowledge, options.start), options.after).to_dict(),
+    "explain": _explain,
+    "vocabulary": lambda knowledge, options: _vocabulary(knowledge),
+    "program": _program,
+}
 
 
 def show(result: dict[str, Any]) -> None:
