@@ -150,6 +150,33 @@ class Shield:
         rows = [self.advise(c, t, int(x)).allowed for c, t, x in zip(codes, truth, configurations, strict=True)]
         return np.array(rows, dtype=bool).reshape(len(codes), len(self._actions))
 
+    def constrain(self, probabilities: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        """A distribution over actions without the forbidden ones: knowledge from people as a prior.
+
+        With a shield over the person's actions ("a person facing a wall does not walk forward"), this constrains
+        the influence I(u | l).
+
+        Args:
+            probabilities: float [B, A], rows sum to 1.
+            mask: bool [B, A], as from `mask`.
+
+        Returns:
+            float64 [B, A]: forbidden entries 0, rows renormalised; uniform over the allowed actions where the
+            distribution held only forbidden ones possible.
+
+        Raises:
+            UserError: the shapes do not fit.
+        """
+        if probabilities.shape != mask.shape or mask.shape[1:] != (len(self._actions),):
+            raise UserError(
+                f"expected two arrays [B, {len(self._actions)}], found {list(probabilities.shape)} and "
+                f"{list(mask.shape)}"
+            )
+        kept = np.where(mask, probabilities, 0.0)
+        totals = kept.sum(axis=1, keepdims=True)
+        uniform = mask / mask.sum(axis=1, keepdims=True)
+        return np.where(totals > 0, kept / np.where(totals > 0, totals, 1.0), uniform)
+
     def _ask(self, code: np.ndarray, truth: np.ndarray, configuration: int) -> Advice:
         true = {clingo.Function("now", [clingo.Function(asp_name(self.predicates[p]))]) for p in np.flatnonzero(truth)}
         if self._uses_code:

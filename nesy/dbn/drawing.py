@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -70,6 +71,7 @@ def _panel(dbn: TwoSliceDBN, action: int, axis: Axes) -> None:
         )
     axis.set_title(dbn.action_names[action], fontsize=10)
     axis.set_xlim(-0.25, 1.45)
+    axis.set_ylim(-dbn.num_factors + 0.5, 0.5)
     axis.axis("off")
 
 
@@ -96,7 +98,8 @@ def draw_factor(dbn: TwoSliceDBN, codebook: Codebook, factor: int, path: Path | 
             # views are indexed [vx, vy]; pictures have the row first
             axis.imshow(mean_view(codebook.views[chosen]).transpose(1, 0, 2))
             meaning = dbn.value_meanings[factor][value] if dbn.value_meanings else ""
-            axis.set_xlabel(f"{int(chosen.sum())} views\n" + "\n".join(meaning.split(", ")), fontsize=6)
+            lines = [line for part in meaning.split(", ") for line in textwrap.wrap(part, 26)]
+            axis.set_xlabel("\n".join([f"{int(chosen.sum())} views", *lines]), fontsize=6)
         else:
             axis.set_xlabel("not met", fontsize=6)
     figure.suptitle(f"Values of {dbn.factor_names[factor]}", fontsize=10)

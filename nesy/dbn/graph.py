@@ -30,28 +30,31 @@ def to_networkx(dbn: TwoSliceDBN, action: int | None = None) -> networkx.MultiDi
 
 
 def arc_strength(dbn: TwoSliceDBN, action: int, factor: int) -> list[float]:
-    """How far each parent's value can change the factor's distribution.
+    """How far each parent's value changes the factor's distribution, on average.
 
-    Largest total variation between two rows that differ in that parent alone, over the rows met in
-    experience where both were, else over all rows.
+    Mean total variation between two rows that differ in that parent alone, over the pairs of which both rows were
+    met in experience, weighted by the rarer one's visits; over all pairs alike where there is no such pair.
 
     Returns:
         One number in [0, 1] per parent, in the order of `TwoSliceDBN.parents`.
     """
     k = dbn.num_values
-    table, visited = dbn.tensor(action, factor), dbn.counts(action, factor) > 0
-    known = bool(visited.any())
-    visited = visited.reshape(table.shape[:-1])
+    table = dbn.tensor(action, factor)
+    visits = dbn.counts(action, factor).reshape(table.shape[:-1])
     result = []
     for axis in range(table.ndim - 1):
         rows = np.moveaxis(table, axis, 0).reshape(k, -1, k)
-        seen = np.moveaxis(visited, axis, 0).reshape(k, -1)
-        strongest = 0.0
+        seen = np.moveaxis(visits, axis, 0).reshape(k, -1)
+        far = weight = far_everywhere = 0.0
         for left in range(k):
             for right in range(left + 1, k):
-                pairs = seen[left] & seen[right] if known else np.ones(rows.shape[1], dtype=bool)
-                if pairs.any():
-                    distance = 0.5 * np.abs(rows[left, pairs] - rows[right, pairs]).sum(axis=1).max()
-                    strongest = max(strongest, float(distance))
-        result.append(min(strongest, 1.0))
+                pairs = np.minimum(seen[left], seen[right])
+                met = np.flatnonzero(pairs)
+                chosen = met if visits.any() else np.arange(rows.shape[1])
+                distance = 0.5 * np.abs(rows[left, chosen] - rows[right, chosen]).sum(axis=1)
+                far += float((distance * pairs[chosen]).sum())
+                weight += float(pairs[chosen].sum())
+                far_everywhere += float(distance.mean()) if len(distance) else 0.0
+        pairs_of_values = k * (k - 1) / 2
+        result.append(min(1.0, far / weight if weight else far_everywhere / max(1.0, pairs_of_values)))
     return result

@@ -303,8 +303,8 @@ class TwoSliceDBN:
     def to_networkx(self, action: int | None = None) -> networkx.MultiDiGraph:
         """The graph: nodes `X0` (slice t) and `X0'` (slice t+1); an edge per action and parent.
 
-        Every edge has the attributes `action` (its name) and `strength` (how far the parent's value can
-        change the child's distribution: largest total variation over the rows met in experience, in [0, 1]).
+        Every edge has the attributes `action` (its name) and `strength` (how far the parent's value changes the
+        child's distribution on average, in [0, 1]; see nesy.dbn.graph.arc_strength).
         """
         from nesy.dbn.graph import to_networkx
 

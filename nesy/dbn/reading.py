@@ -43,7 +43,7 @@ def _overview(dbn: TwoSliceDBN, actions: range | tuple[int, ...]) -> str:
     lines = [
         f"2DBN: {dbn.num_factors} factors x {dbn.num_values} values, {dbn.num_actions} actions, "
         f"{len(dbn.probabilities)} rows, {int((dbn.row_counts > 0).sum())} met in experience",
-        "A stroke marks slice t+1; the number after a parent says how far its value can change the factor.",
+        "A stroke marks slice t+1; the number after a parent says how far its value changes the factor (0 to 1).",
     ]
     for a in actions:
         lines += ["", f"{dbn.action_names[a]}:"]

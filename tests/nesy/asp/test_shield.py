@@ -154,3 +154,13 @@ def test_no_forbidden_action_is_taken_in_the_real_environment():
         blocked += int(ahead.sum())
         observation = environment.step(actions)[0]
     assert forward > 500 and blocked > 500
+
+
+def test_rules_constrain_a_distribution_over_the_person_s_actions():
+    shield = make("forbidden(forward) :- now(wall_ahead).")
+    mask = shield.mask(np.zeros((3, 8), dtype=np.uint8), np.array([[True], [False], [True]]), np.zeros(3, dtype=int))
+    prior = np.array([[0.1, 0.1, 0.8, 0.0], [0.1, 0.1, 0.8, 0.0], [0.0, 0.0, 1.0, 0.0]])
+    constrained = shield.constrain(prior, mask)
+    np.testing.assert_allclose(constrained, [[0.5, 0.5, 0.0, 0.0], prior[1], [1 / 3, 1 / 3, 0.0, 1 / 3]])
+    with pytest.raises(UserError, match="expected"):
+        shield.constrain(prior[:, :2], mask)

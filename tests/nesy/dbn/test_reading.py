@@ -47,7 +47,7 @@ def test_the_graph_has_an_edge_per_parent():
     assert dbn.to_networkx(0).number_of_edges() == 3
 
 
-def test_strength_is_the_largest_change_among_rows_met():
+def test_strength_is_the_mean_change_among_rows_met():
     table = np.array([[1.0, 0.0], [0.5, 0.5], [0.0, 1.0], [0.0, 1.0]])
     dbn = TwoSliceDBN.from_tables([[table, np.eye(2)]], [[[0, 1], [1]]], counts=[[np.array([1, 1, 1, 0]), np.ones(2)]])
     assert arc_strength(dbn, 0, 0) == [1.0, 0.5]
