@@ -10,13 +10,13 @@ PRESET ?= quick
 CORES := $(shell $(PYTHON) -c "import os; print(min(os.cpu_count() or 1, 4))" 2>/dev/null || echo 2)
 BIN := .venv/bin
 
-.PHONY: demo test lint setup setup-dev clean
+.PHONY: demo test lint setup setup-dev setup-check clean
 
 demo: setup
 	$(BIN)/nesy run --preset $(PRESET) --run "$(RUN)" --jobs $(CORES)
 
 test: setup-dev
-	$(BIN)/python -m pytest -n $(CORES)
+	$(BIN)/python -m pytest -n $(CORES) --dist loadfile
 
 lint: setup-dev
 	$(BIN)/ruff check .
@@ -25,6 +25,8 @@ lint: setup-dev
 
 setup: .venv/installed
 setup-dev: .venv/installed-dev
+# the independent tools that the tests marked `check` compare with; without them those tests are skipped
+setup-check: .venv/installed-check
 
 # The stamps are written last, so an interrupted installation is done again.
 .venv/bin/python:
@@ -38,6 +40,10 @@ setup-dev: .venv/installed-dev
 
 .venv/installed-dev: .venv/installed
 	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e ".[dev]"
+	touch $@
+
+.venv/installed-check: .venv/installed-dev
+	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e ".[dev,check]"
 	touch $@
 
 clean:
