@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+import numpy as np
+import pomdp_py
+import pytest
+
+from planners import kernels
+from planners.config import SearchConfig
+from planners.ialm_search import IALMSearch
+from planners.pomdp_py_adapter import LocalEnvironment, LocalState, POUCTAgent, RobotAction, RobotAgent
+from planners.tree import allocate, backup, best_by_ucb, find_child
+from tests.planners.models import N, small_ialm
+
+START = np.array([0, 0, 0, 1, 2, 2, 3, 0, 0], np.int16)
+CONFIG = SearchConfig(simulations=3000, depth=3, exploration=1.0, pomdp_py_simulations=200)
+
+
+def _optimum(depth: int) -> np.ndarray:
+    """Q of the small model, whose reward comes with ahead = 3 (shifted): by expectimax over sampled transitions."""
+    model = small_ialm(0)
+    compiled = kernels.compile_model(model)
+    bits = np.array([7], np.uint64)
+    after, v = np.zeros_like(START), np.zeros(64, np.int16)
+    transition = np.zeros((4, 5, 5))
+    reward = np.zeros((4, 5))
+    # Only `ahead` matters for reward; it depends on codes, so this table is an average, good enough for ranking.
+    for a in range(4):
+        for here in range(5):
+            state = START.copy()
+            state[2 * N + 1] = here
+            for _ in range(3000):
+                state[: 2 * N] = np.random.default_rng(int(bits[0] % 2**31)).integers(0, 2, 2 * N)
+                r, _, _ = kernels.step(compiled, state, a, after, v, bits)
+                transition[a, here, after[2 * N + 1]] += 1 / 3000
+                reward[a, here] += r / 3000
+    value = np.zeros(5)
+    q = np.zeros((4, 5))
+    for _ in range(depth):
+        q = reward + 0.9 * transition @ value
+        value = q.max(axis=0)
+    return q[:, START[2 * N + 1]]
+
+
+def _beliefs() -> np.ndarray:
+    rng = np.random.default_rng(0)
+    states = np.tile(START, (200, 1))
+    states[:, : 2 * N] = rng.integers(0, 2, (200, 2 * N))
+    return states
+
+
+def test_search_and_pomdp_py_find_the_best_action_of_a_small_model() -> None:
+    model = small_ialm(0)
+    compiled = kernels.compile_model(model)
+    q = _optimum(3)
+    best, info = IALMSearch(model, compiled, CONFIG, np.random.default_rng(1)).plan(_beliefs())
+    assert q[best] >= q.max() - 0.1
+    assert sum(info["visits"]) == info["simulations"] == 3000
+    assert info["max_depth"] == 3
+    assert max(info["values"]) == pytest.approx(q.max(), abs=0.25)
+    theirs, seen = POUCTAgent(model, compiled, CONFIG, np.random.default_rng(1)).plan(_beliefs())
+    assert q[theirs] >= q.max() - 0.25
+    assert seen["simulations"] == 200
+
+
+def test_same_seed_same_plan_and_masks_hold() -> None:
+    model = small_ialm(0)
+    compiled = kernels.compile_model(model)
+    runs = [IALMSearch(model, compiled, CONFIG, np.random.default_rng(3)).plan(_beliefs()) for _ in range(2)]
+    assert runs[0] == runs[1]
+    only = np.array([True, False, False, True])
+    action, info = IALMSearch(model, compiled, CONFIG, np.random.default_rng(3)).plan(_beliefs(), only)
+    assert only[action]
+    assert info["visits"][1] == info["visits"][2] == 0
+    with pytest.raises(ValueError, match="at least one allowed action"):
+        IALMSearch(model, compiled, CONFIG, np.random.default_rng(3)).plan(_beliefs(), np.zeros(4, np.bool_))
+
+
+def test_terminal_states_stay_and_earn_nothing() -> None:
+    model = small_ialm(0, ends=True)
+    compiled = kernels.compile_model(model)
+    agent = RobotAgent(model, compiled, _beliefs(), np.random.default_rng(0))
+    terminal = LocalState(START, reward=5.0, outcome=1)
+    after = agent.transition_model.sample(terminal, RobotAction(0, "left"))
+    assert after == terminal
+    assert agent.reward_model.sample(terminal, RobotAction(0, "left"), after) == 0.0
+
+
+def test_genuine_pomdp_py_classes() -> None:
+    model = small_ialm(0)
+    compiled = kernels.compile_model(model)
+    rng = np.random.default_rng(0)
+    agent = RobotAgent(model, compiled, _beliefs(), rng)
+    environment = LocalEnvironment(model, compiled, LocalState(START), rng)
+    assert isinstance(agent, pomdp_py.Agent)
+    assert isinstance(environment, pomdp_py.Environment)
+    planner = pomdp_py.POUCT(max_depth=3, num_sims=50, rollout_policy=agent.policy_model)
+    action = planner.plan(agent)
+    reward = environment.state_transition(action, execute=True)
+    observation = agent.observation_model.sample(environment.state, action)
+    agent.update_history(action, observation)
+    planner.update(agent, action, observation)
+    assert np.isfinite(reward)
+    assert agent.observation_model.probability(observation, environment.state, action) == 1.0
+
+
+def test_tree_counts_and_averages() -> None:
+    tree = allocate(4, 2)
+    everything = np.ones(2, np.bool_)
+    assert best_by_ucb(tree, 0, 1.0, everything) == 0
+    made = find_child(tree, 0, 0, 99, True)
+    assert made == -2  # node 1, new
+    assert find_child(tree, 0, 0, 99, True) == 1
+    assert find_child(tree, 0, 1, 99, False) < -1000
+    nodes, actions = np.array([0, 1]), np.array([0, 1])
+    value = backup(tree, nodes, actions, np.array([1.0, 2.0]), 2, 4.0, 0.5)
+    assert value == 1.0 + 0.5 * (2.0 + 0.5 * 4.0)
+    backup(tree, nodes, actions, np.array([3.0, 0.0]), 1, 0.0, 0.5)
+    assert tree.q_value[0, 0] == pytest.approx((3.0 + 3.0) / 2)
+    assert tree.q_visits[0].tolist() == [2, 0]
+    assert best_by_ucb(tree, 0, 1.0, everything) == 1
+    assert find_child(tree, 0, 1, 1, True) == -3
+    assert find_child(tree, 0, 1, 2, True) == -4
+    assert find_child(tree, 0, 1, 3, True) < -1000  # full

@@ -1,0 +1,55 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from planners.statistics import (
+    bootstrap,
+    interquartile_mean,
+    performance_profile,
+    probability_of_improvement,
+    running_average,
+    stratified_bootstrap,
+)
+
+
+def test_interval_of_the_mean_covers_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(0)
+    covered = 0
+    for trial in range(200):
+        interval = bootstrap(rng.normal(3.0, 1.0, 50), seed=trial, resamples=400)
+        covered += interval.low <= 3.0 <= interval.high
+    assert 0.88 <= covered / 200 <= 0.99
+
+
+def test_intervals_repeat_and_degenerate_cases_are_exact() -> None:
+    values = np.random.default_rng(1).random(30)
+    assert bootstrap(values, seed=5) == bootstrap(values, seed=5)
+    same = bootstrap(np.full(4, 2.0), seed=0)
+    assert (same.mean, same.low, same.high) == (2.0, 2.0, 2.0)
+    with pytest.raises(ValueError, match="at least one"):
+        bootstrap(np.zeros(0), seed=0)
+
+
+def test_stratified_interval_leaves_out_the_spread_between_groups() -> None:
+    rng = np.random.default_rng(2)
+    groups = np.repeat(np.arange(10), 20)
+    values = groups * 10.0 + rng.normal(0, 1, 200)
+    plain, stratified = bootstrap(values, 0), stratified_bootstrap(values, groups, 0)
+    assert stratified.mean == pytest.approx(plain.mean)
+    assert stratified.high - stratified.low < 0.1 * (plain.high - plain.low)
+
+
+def test_robust_measures() -> None:
+    assert interquartile_mean(np.array([-1000.0, 1.0, 2.0, 1000.0])) == 1.5
+    assert performance_profile(np.array([1.0, 2.0, 3.0]), np.array([0.0, 1.5, 5.0])).tolist() == [1.0, 2 / 3, 0.0]
+    better = probability_of_improvement(np.arange(10) + 100.0, np.arange(10.0), seed=0, resamples=50)
+    assert better.mean == better.low == 1.0
+    equal = probability_of_improvement(np.arange(10.0), np.arange(10.0), seed=0, resamples=50)
+    assert equal.mean == 0.5
+
+
+def test_running_averages_by_hand() -> None:
+    values = np.array([1.0, 3.0, 5.0, 7.0])
+    assert running_average(values).tolist() == [1.0, 2.0, 3.0, 4.0]
+    assert running_average(values, 2).tolist() == [1.0, 2.0, 4.0, 6.0]
