@@ -1,8 +1,16 @@
 """Domains: batched environments, their exact oracles and their metrics."""
 
+from domains.checker import DomainReport, check_domain
 from domains.core import DomainError, load_domain, register_domain
 
-__all__ = ["DomainError", "load_domain", "register_domain", "register_environments"]
+__all__ = [
+    "DomainError",
+    "DomainReport",
+    "check_domain",
+    "load_domain",
+    "register_domain",
+    "register_environments",
+]
 
 _ENVIRONMENTS = {"nesy/PersonFollowing-v0": "following", "nesy/Crossing-v0": "crossing"}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -57,7 +58,7 @@ def _check(row, steps):
     outcome = steps[-1][3]["outcome"]
     assert [name for name in ("success", "agent_at_goal", "lost", "unescorted", "timeout") if row[name]] == [outcome]
     # Cells that the robot moved: from one state's pose to the next; the last move only shows in the pose's change.
-    moved = sum(a[0]["agent"][:2] != b[0]["agent"][:2] for a, b in zip(steps, steps[1:], strict=False))
+    moved = sum(a[0]["agent"][:2] != b[0]["agent"][:2] for a, b in pairwise(steps))
     assert moved <= row["path_length"] <= moved + 1
     turns = sum(step[1] in (0, 1) for step in steps)
     assert row["heading_changes"] == turns
