@@ -19,10 +19,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from domains.core import Domain, DomainError, OracleResult, load_domain
+from domains.core import Domain, DomainError, load_domain
 from nesy.errors import UserError
 from nesy.progress import SILENT, Progress
-from nesy.run_folder import RunFolder, atomic_path, read_json
+from nesy.run_folder import RunFolder, atomic_path, read_json, write_json
 from planners import config as settings
 from planners.config import CompareConfig, SearchConfig
 from planners.evaluation import Columns, evaluate, outcome_names
@@ -120,8 +120,8 @@ def compare(
     tables = [pq.read_table(_path(run, cell)) for cell in cells]
     with atomic_path(run.results / "episodes.parquet") as temporary:
         pq.write_table(pa.concat_tables(tables).replace_schema_metadata(None), temporary, compression="zstd")
-    oracles = {variant: _oracle(domain, variant) for variant in config.variants}
-    return summarise(cells, tables, config, oracles)
+    optima = {variant: _optimum(run, domain, variant) for variant in config.variants}
+    return summarise(cells, tables, config, optima)
 
 
 def ensure_ialm(
@@ -182,7 +182,7 @@ def run_cell(
 
 
 def summarise(
-    cells: list[Cell], tables: list[pa.Table], config: CompareConfig, oracles: dict[str, OracleResult | None]
+    cells: list[Cell], tables: list[pa.Table], config: CompareConfig, optima: dict[str, dict[str, float] | None]
 ) -> list[dict[str, Any]]:
     """One record per (agent, inputs, influence, variant), seeds pooled."""
     groups: dict[tuple[str, str, str, str], list[int]] = {}
@@ -194,11 +194,11 @@ def summarise(
         returns = np.concatenate([row["return"].to_numpy() for row in rows])
         success = np.concatenate([row["outcome"].to_numpy(zero_copy_only=False) for row in rows]) == "success"
         milliseconds = np.concatenate([row["ms"].to_numpy() for row in rows])
-        oracle = oracles.get(variant)
+        optimum = optima.get(variant)
         mean_return = bootstrap(returns, seed=0, confidence=config.confidence).as_dict()
         mean_success = bootstrap(success, seed=0, confidence=config.confidence).as_dict()
-        if agent == "optimum" and oracle is not None:
-            mean_return, mean_success = _exact(oracle.mean_return), _exact(oracle.success)
+        if agent == "optimum" and optimum is not None:
+            mean_return, mean_success = _exact(optimum["mean_return"]), _exact(optimum["success"])
         records.append(
             {
                 "agent": agent,
@@ -210,7 +210,7 @@ def summarise(
                 "return": mean_return,
                 "success": mean_success,
                 "ms_per_decision": float(np.median(milliseconds)),
-                "share_of_optimum": None if oracle is None else mean_return["mean"] / oracle.mean_return,
+                "share_of_optimum": None if optimum is None else mean_return["mean"] / optimum["mean_return"],
             }
         )
     return records
@@ -220,11 +220,17 @@ def _exact(value: float) -> dict[str, Any]:
     return {**Interval(value, value, value).as_dict(), "low": None, "high": None}
 
 
-def _oracle(domain: Domain, variant: str) -> OracleResult | None:
-    try:
-        return domain.optimum(variant)
-    except DomainError:
-        return None
+def _optimum(run: RunFolder, domain: Domain, variant: str) -> dict[str, float] | None:
+    """Mean return and success of the exact optimum; worked out once and kept. None where it is out of reach."""
+    path = run.results / f"optimum-{variant}.json"
+    if not path.is_file():
+        try:
+            oracle = domain.optimum(variant)
+        except DomainError:
+            return None
+        write_json(path, {"mean_return": oracle.mean_return, "success": oracle.success})
+    value = read_json(path)
+    return {name: float(value[name]) for name in ("mean_return", "success")}
 
 
 def _episodes_evaluated(config: CompareConfig, cell: Cell) -> int:

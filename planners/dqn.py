@@ -249,7 +249,7 @@ def train(
     replay = Replay(config.memory, config.num_envs, state.shape[1])
     finished: list[tuple[float, int, int, int]] = []
     running_return, running_length = np.zeros(config.num_envs), np.zeros(config.num_envs, np.int64)
-    steps, owed = 0, 0.0
+    steps, owed, told = 0, 0.0, 0
     with progress.task(f"dqn {inputs}/{influence}", config.episodes) as task:
         while len(finished) < config.episodes:
             done_share = len(finished) / config.episodes
@@ -281,7 +281,8 @@ def train(
             running_return[done], running_length[done] = 0.0, 0
             if done.any():
                 recent = float(np.mean([row[0] for row in finished[-200:]]))
-                task.advance(int(done.sum()), mean_return=recent)
+                task.advance(min(int(done.sum()), config.episodes - told), mean_return=recent)
+                told = min(told + int(done.sum()), config.episodes)
             if steps < config.warm_up:
                 continue
             owed += config.updates_per_step * config.num_envs

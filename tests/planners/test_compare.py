@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from domains.core import load_domain
+from nesy.errors import UserError
+from nesy.run_folder import RunFolder
+from planners.baselines import LastSeenFollower, OracleFollower
+from planners.compare import EVALUATION_SEED, compare, grid
+from planners.config import CompareConfig
+from planners.evaluation import evaluate
+
+REFERENCES = CompareConfig(agents=("greedy-follower", "random", "greedy-last-seen"), episodes=42)
+
+
+@pytest.fixture(autouse=True)
+def _no_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The exact optimum takes seconds and has tests of its own."""
+    monkeypatch.setattr("planners.compare._optimum", lambda run, domain, variant: {"mean_return": 90.0, "success": 0.8})
+
+
+def _rows(run: RunFolder) -> dict[str, list[object]]:
+    columns = pq.read_table(run.results / "episodes.parquet").to_pydict()
+    del columns["ms"]
+    return columns
+
+
+def test_results_do_not_depend_on_the_number_of_processes(tmp_path: Path) -> None:
+    one, two = RunFolder(tmp_path / "one"), RunFolder(tmp_path / "two")
+    first = compare(one, REFERENCES, jobs=1)
+    second = compare(two, REFERENCES, jobs=2)
+    assert _rows(one) == _rows(two)
+    assert [cell["return"] for cell in first] == [cell["return"] for cell in second]
+    assert [cell["agent"] for cell in first] == list(REFERENCES.agents)
+    assert first[0]["share_of_optimum"] == pytest.approx(first[0]["return"]["mean"] / 90.0)
+
+
+def test_a_finished_cell_is_not_run_again_and_a_damaged_one_is(tmp_path: Path) -> None:
+    run = RunFolder(tmp_path)
+    compare(run, REFERENCES)
+    files = sorted((run.results / "cells").iterdir())
+    before = _rows(run)
+    files[0].write_bytes(files[0].read_bytes()[:100])
+    untouched = files[1].stat().st_mtime_ns
+    compare(run, REFERENCES)
+    assert files[1].stat().st_mtime_ns == untouched
+    assert files[0].stat().st_size > 100
+    assert _rows(run) == before
+
+
+def test_followers_reach_the_known_figures() -> None:
+    domain = load_domain()
+    follower = evaluate(domain, "paper", OracleFollower(), None, 42, EVALUATION_SEED)
+    assert follower["return"].mean() == pytest.approx(90.3, abs=0.7)
+    assert (follower["outcome"] == 1).mean() == pytest.approx(0.807, abs=0.01)
+    last_seen = evaluate(domain, "paper", LastSeenFollower(domain.spec.geometry), None, 42, EVALUATION_SEED)
+    assert last_seen["return"].mean() > 85
+    assert np.unique(follower["map_id"]).size == 42
+
+
+def test_mistakes_are_named() -> None:
+    for change, message in (
+        ({"agents": ("dqm",)}, "unknown agent 'dqm'"),
+        ({"inputs": ("all",)}, "unknown input set 'all'"),
+        ({"influences": ("telepathy",)}, "unknown influence mode 'telepathy'"),
+        ({"agents": ()}, "list of agents is empty"),
+        ({"episodes": 0}, "at least one evaluation episode"),
+    ):
+        with pytest.raises(UserError, match=message):
+            grid(CompareConfig(**change))
+
+
+def test_grid_has_every_cell_once() -> None:
+    config = CompareConfig(
+        agents=("dqn", "search", "random"), inputs=("paper", "full"), influences=("zero", "random"), seeds=(0, 1)
+    )
+    cells = grid(config)
+    assert len(cells) == len({cell.name for cell in cells}) == 2 * 2 * 2 + 2 * 2 + 2
