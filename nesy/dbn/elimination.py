@@ -84,6 +84,10 @@ class _Planner:
         pool += [_Tensor((p,), False, p * k, (1,)) for p in sorted(now)]
         target = n + factor
         out = _Tensor((target,), False, target * k, (1,))
+        if len(pool) == 1 + len(now):
+            # one table and a belief for each of its parents: its rows are mixed in one go
+            self.operations.append(((target,), tuple(sorted(now)), pool, out))
+            return
         waiting = {v for tensor in pool for v in tensor.scope} - {target}
         while waiting:
             variable = min(waiting, key=lambda v: (len(_scope(pool, v)), v))
@@ -129,7 +133,12 @@ def plan_updates(dbn: TwoSliceDBN) -> Programs:
             planner.plan(a, i)
         first.append(len(planner.operations))
     operations = planner.operations
-    loops = [_loops(result, summed, dbn.num_factors) for result, summed, _, _ in operations]
+    mixes = [_mixes(result, tensors) for result, _, tensors, _ in operations]
+    loops = [
+        # rows are mixed in the order of the table, so that their weights are a Kronecker product
+        _loops(result, tensors[0].scope[:-1] if mixed else summed, dbn.num_factors)
+        for (result, summed, tensors, _), mixed in zip(operations, mixes, strict=True)
+    ]
     inputs = max(len(tensors) for _, _, tensors, _ in operations)
     width = max(1, max(len(outer) + len(summed) for outer, summed, _ in loops))
     number = len(operations)
@@ -145,7 +154,7 @@ def plan_updates(dbn: TwoSliceDBN) -> Programs:
         inner=np.zeros((number, inputs), dtype=np.int64),
         out_base=np.array([out.offset for _, _, _, out in operations], dtype=np.int64),
         out_strides=np.zeros((number, width), dtype=np.int64),
-        mixes=np.array([_mixes(result, tensors) for result, _, tensors, _ in operations]),
+        mixes=np.array(mixes),
         memory=planner.memory,
     )
     for o, ((_, _, tensors, out), (outer, summed, inner)) in enumerate(zip(operations, loops, strict=True)):

@@ -12,6 +12,8 @@ from nesy.dbn.elimination import Programs, plan_updates
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
 
+MOST_WEIGHTS = 4096
+
 
 @njit(cache=True)
 def _sum_products(
@@ -93,11 +95,32 @@ def _mix_rows(
     digits: np.ndarray,
     starts: np.ndarray,
     weights: np.ndarray,
+    kronecker: np.ndarray,
     accumulator: np.ndarray,
 ) -> None:
     """One operation of the usual kind; weights and row starts are kept per depth, only the last parent's change."""
     num_values = accumulator.shape[0]
     loops = programs.num_loops[o]
+    total, inside = 1, 1
+    for position in range(loops):
+        total *= num_values
+        inside *= sizes[programs.variables[o, position]]
+    if total <= kronecker.shape[0] and 4 * inside >= total:
+        # most rows have some weight: one matrix product
+        kronecker[0] = 1.0
+        count = 1
+        for position in range(loops):
+            start = programs.variables[o, position] * num_values
+            for row in range(count - 1, -1, -1):
+                scale = kronecker[row]
+                for value in range(num_values):
+                    kronecker[row * num_values + value] = scale * memory[start + value]
+            count *= num_values
+        first = programs.base[o, 0]
+        block = tables[first : first + total * num_values].reshape(total, num_values)
+        np.dot(kronecker[:total], block, accumulator)
+        memory[programs.out_base[o] : programs.out_base[o] + num_values] = accumulator
+        return
     accumulator[:] = 0.0
     starts[0], weights[0] = programs.base[o, 0], 1.0
     depth = 0
@@ -159,6 +182,7 @@ def _run(programs: Programs, tables: np.ndarray, beliefs: np.ndarray, actions: n
     offsets = np.zeros(programs.base.shape[1], dtype=np.int64)
     starts = np.zeros(programs.variables.shape[1] + 1, dtype=np.int64)
     weights = np.zeros(programs.variables.shape[1] + 1)
+    kronecker = np.empty(MOST_WEIGHTS)
     accumulator, product = np.empty(num_values), np.empty(num_values)
     for b in range(number):
         for i in range(n):
@@ -170,7 +194,7 @@ def _run(programs: Programs, tables: np.ndarray, beliefs: np.ndarray, actions: n
                     sizes[i] += 1
         for o in range(programs.first[actions[b]], programs.first[actions[b] + 1]):
             if programs.mixes[o]:
-                _mix_rows(programs, o, tables, memory, support, sizes, digits, starts, weights, accumulator)
+                _mix_rows(programs, o, tables, memory, support, sizes, digits, starts, weights, kronecker, accumulator)
             else:
                 _sum_products(programs, o, tables, memory, support, sizes, digits, offsets, accumulator, product)
         for i in range(n):
