@@ -107,6 +107,41 @@ def transitions_of(
     return _from_edges(distinct, visits, edges, weight)
 
 
+def with_mirror(transitions: Transitions, views: np.ndarray | None = None) -> Transitions:
+    """The transitions and their mirror images: left and right change places in views and actions.
+
+    The world has no handedness: the mirror image of a map is a map as likely, so every step met stands for two.
+
+    Args:
+        transitions: any.
+        views: uint8 [m, v, v], distinct, the views to index; they must hold all views and their mirror images. By
+            default those of `transitions` with their mirror images.
+    """
+    t = transitions
+    mirrored = t.views[:, ::-1]
+    keys = view_keys(np.concatenate([t.views, mirrored]))
+    if views is None:
+        unique, first = np.unique(keys, return_index=True)
+        views = np.concatenate([t.views, mirrored])[first]
+    else:
+        unique = view_keys(views)
+    index = np.searchsorted(unique, keys)
+    assert (unique[np.minimum(index, len(unique) - 1)] == keys).all(), "a view outside the given ones"
+    total = t.num_views
+    same, other = index[:total], index[total:]
+    action = np.array([1, 0, 2, 3])[t.action]
+    edge = np.concatenate(
+        [
+            (same[t.source] * 4 + t.action) * len(unique) + same[t.target],
+            (other[t.source] * 4 + action) * len(unique) + other[t.target],
+        ]
+    )
+    edges, place = np.unique(edge, return_inverse=True)
+    weight = np.bincount(place, np.tile(t.weight, 2)).astype(np.int64)
+    visits = np.bincount(index, np.tile(t.visits, 2), minlength=len(unique)).astype(np.int64)
+    return _from_edges(views, visits, edges, weight)
+
+
 def reference_transitions(domain: Domain, variant: str, task: str = "following") -> Transitions | None:
     """Every step from every pose of every map, each counted once: the set that no behaviour has chosen.
 

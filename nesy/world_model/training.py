@@ -21,11 +21,13 @@ from nesy.config import TrainConfig
 from nesy.errors import UserError
 from nesy.experience import Experience
 from nesy.progress import SILENT, Progress
+from nesy.run_folder import write_json
 from nesy.world_model.codec import SymbolicCodec
-from nesy.world_model.distinct import Transitions, reference_transitions, transitions_of
+from nesy.world_model.distinct import Transitions, reference_transitions, transitions_of, with_mirror
 from nesy.world_model.gates import evaluate
 from nesy.world_model.logs import MetricsLog
 from nesy.world_model.paper_training import PaperTrainer
+from nesy.world_model.readability import readability
 from nesy.world_model.storage import load_tensors, save_tensors, save_world_model
 from nesy.world_model.symbolic_training import SymbolicTrainer
 
@@ -61,7 +63,8 @@ def train(
     Returns:
         The gates with the limits of the data beside them (see `gates.evaluate`): views of all kinds, transitions
         of the crossing task; `following`, the same for the transitions of the following task; `held_out`, figures
-        from before any held-out map was learned from; `epochs`, `seconds`, `architecture`.
+        from before any held-out map was learned from; `readability` (details in readability.json); `epochs`, `seconds`,
+        `architecture`.
 
     Raises:
         UserError: impossible settings, or no experience.
@@ -87,12 +90,12 @@ def _train(
 ) -> dict[str, Any]:
     references = {} if domain is None else _references(domain, variant)
     known = [reference.views for reference in references.values()]
-    everything = transitions_of(experience, views=np.concatenate(known) if known else None)
+    everything = with_mirror(transitions_of(experience, views=np.concatenate(known) if known else None))
     training, held_out = everything, None
     if config.held_out > 0:
         apart = experience.held_out_maps(config.held_out, np.random.default_rng(seed))
         if apart.any() and not apart.all():
-            training = transitions_of(experience.select(~apart), base=everything)
+            training = with_mirror(transitions_of(experience.select(~apart)), views=everything.views)
             held_out = transitions_of(experience.select(apart))
     trainer: Trainer = TRAINERS[config.architecture](config, seed, everything, training, held_out)
     fingerprint = _fingerprint(config, seed, everything)
@@ -111,7 +114,7 @@ def _train(
             shown = {name: figures[name] for name in SHOWN if name in figures}
             bar.advance(1, **shown)
     codec = SymbolicCodec(trainer.model)
-    metrics = {
+    metrics: dict[str, Any] = {
         **evaluate(codec, references.get("crossing", everything), everything.views),
         **({"following": evaluate(codec, references["following"])} if references else {}),
         "held_out": trainer.held_out_figures,
@@ -119,6 +122,11 @@ def _train(
         "epochs": tick,
         "seconds": round(elapsed, 2),
     }
+    if domain is not None:
+        truth = domain.predicates.evaluate(everything.views)
+        read = readability(codec.codes(everything.views), truth, domain.predicates.names, codec.num_values)
+        write_json(folder / "readability.json", read)
+        metrics["readability"] = {name: read[name] for name in ("mean_factors", "single", "mean_information")}
     save_world_model(trainer.model, folder, metrics)
     return metrics
 

@@ -28,15 +28,16 @@ def views_along(corridor: np.ndarray) -> np.ndarray:
 
 
 def toy_experience(seed: int = 0, steps: int = 1500) -> Experience:
-    """Walks in corridors: forward goes on, left turns back to the start, right and stay do nothing."""
+    """Walks in corridors: forward goes on, left and right lead back to the start, stay does nothing."""
     rng = np.random.default_rng(seed)
-    corridors = [rng.integers(0, 2, 7) for _ in range(8)]
+    corridors = [views_along(rng.integers(0, 2, 7)) for _ in range(4)]
+    corridors += [views[:, ::-1] for views in corridors]  # the world has no handedness
     rows: dict[str, list[np.ndarray | int]] = {"view": [], "next_view": [], "action": [], "map_id": []}
     place, which = 0, 0
     for _ in range(steps):
-        views = views_along(corridors[which])
+        views = corridors[which]
         action = int(rng.integers(4))
-        then = 0 if action == 0 else min(place + 1, 6) if action == 2 else place
+        then = 0 if action < 2 else min(place + 1, 6) if action == 2 else place
         rows["view"].append(views[place])
         rows["next_view"].append(views[then])
         rows["action"].append(action)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nesy.world_model import SymbolicCodec
-from nesy.world_model.distinct import Transitions, transitions_of, unobstructed, view_keys
+from nesy.world_model.distinct import Transitions, transitions_of, unobstructed, view_keys, with_mirror
 from nesy.world_model.gates import evaluate, limits, view_gates
 
 
@@ -78,3 +78,21 @@ def test_views_that_share_a_code_are_counted(codec: SymbolicCodec, toy) -> None:
     assert figures["views_exact"] == pytest.approx(1 / len(views))
     assert figures["values_used"] == [1] * 8
     assert figures["perplexity"] == pytest.approx([1.0] * 8)
+
+
+def test_mirror_images_are_added_once(toy) -> None:  # type: ignore[no-untyped-def]
+    plain = transitions_of(toy)
+    both = with_mirror(plain)
+    assert both.weight.sum() == 2 * plain.weight.sum()
+    keys = view_keys(both.views)
+    edges = {
+        (int(keys[s]), int(a), int(keys[t])) for s, a, t in zip(both.source, both.action, both.target, strict=True)
+    }
+    mirrored = view_keys(both.views[:, ::-1])
+    swap = [1, 0, 2, 3]
+    assert edges == {
+        (int(mirrored[s]), swap[a], int(mirrored[t]))
+        for s, a, t in zip(both.source, both.action, both.target, strict=True)
+    }
+    again = with_mirror(both)
+    assert len(again) == len(both)

@@ -1,0 +1,88 @@
+"""Next-code NLL against the largest number of parents, with and without arcs inside slice t+1.
+
+For every limit the codes of a run's world model are refined anew from noise, so that each limit has codes that
+suit it, and the tables are counted and smoothed as in training. Prints a Markdown table.
+
+    python scripts/parents_table.py --run runs/demo
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from domains.core import load_domain
+from nesy.cli import configuration
+from nesy.experience import Experience
+from nesy.run_folder import RunFolder
+from nesy.world_model import SymbolicCodec, Transitions, load_world_model, reference_transitions
+from nesy.world_model.distinct import transitions_of, view_keys
+from nesy.world_model.gates import limits
+from nesy.world_model.refinement import CodeBook, Refiner
+from nesy.world_model.structure import Limits
+from nesy.world_model.symbolic_training import MOST_PARENTS, NOISE
+from nesy.world_model.tables import all_tables, log_probability
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Options of the script."""
+
+    run: Path = Path("runs/default")
+    """A run with experience and a symbolic world model."""
+    rounds: int = 12
+    """Rounds of refinement for each limit."""
+    seed: int = 0
+    """Seed of the refinement."""
+
+
+def nll_on(book: CodeBook, transitions: Transitions, reference: Transitions) -> float:
+    """NLL in nats of `reference` under tables counted from `transitions`."""
+    codes, t = book.codes, transitions
+    tables = all_tables(book.structure, codes[t.source], t.action, codes[t.target], t.weight, 8)
+    c = codes[np.searchsorted(view_keys(t.views), view_keys(reference.views))]
+    logs = log_probability(book.structure, tables, c[reference.source], reference.action, c[reference.target], 8)
+    return float(-(reference.weight * logs).sum() / reference.weight.sum())
+
+
+def main(arguments: Arguments) -> None:
+    """Print the table."""
+    run = RunFolder.open(arguments.run)
+    run.require("collect", "train")
+    config = configuration.load(run.config)
+    domain = load_domain(config.domain)
+    reference = reference_transitions(domain, config.variant, "crossing")
+    following = reference_transitions(domain, config.variant, "following")
+    views = following.views if following is not None else None
+    transitions = transitions_of(Experience.load(run.experience), views=views)
+    reference = transitions if reference is None else reference
+    start = SymbolicCodec(load_world_model(run.world_model)).codes(transitions.views).astype(np.int64)
+    free = np.zeros((len(start), 8, 8))
+    print(f"limit of the data: {limits(reference)['next_code_nll']:.3f} nats (all maps, poses and actions)\n")
+    print("| parents from slice t | arcs inside t+1 | NLL, nats | counted NLL on the experience | rows | seconds |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for now in (1, 2, 3, 4):
+        for arcs in (0, 2):
+            rng = np.random.default_rng(arguments.seed)
+            began = time.perf_counter()
+            bounds = Limits(now=now, next=arcs, total=min(now + arcs, MOST_PARENTS), penalty=1.0)
+            refiner = Refiner(transitions, 8, 4, bounds)
+            book = refiner.search(start)
+            for step in range(arguments.rounds):
+                noise = NOISE * max(0.0, 1.0 - step / (0.8 * arguments.rounds))
+                book, _ = refiner.refine(book, free, noise, 2, rng)
+            count, _, _ = book.structure.arrays()
+            seconds = time.perf_counter() - began
+            print(
+                f"| {now} | {'at most 2' if arcs else 'none'} | {nll_on(book, transitions, reference):.3f} "
+                f"| {book.nll:.3f} | {int((8**count).sum()):,} | {seconds:.0f} |",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments, description=__doc__))
