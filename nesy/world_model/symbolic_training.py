@@ -45,6 +45,8 @@ NOISE = 12.0
 """Annealing temperature of the refinement at its start, in nats."""
 FIT_EPOCHS = 60
 """Epochs that the third stage may take at least."""
+PASSES = 4
+"""How often an epoch of the third stage shows every view."""
 SWEEPS = 2
 """Passes over the code book per round of refinement."""
 
@@ -225,8 +227,8 @@ class SymbolicTrainer:
         self._set_learning_rate(done)
         t, model = self.final, self.model
         codes = torch.as_tensor(self.book.codes, device=self.device)
-        steps = max(8, min(MOST_STEPS, t.num_views // self.config.batch_size))
-        size = min(t.num_views, max(self.config.batch_size, t.num_views // steps))
+        size = min(t.num_views, self.config.batch_size)
+        steps = max(8, min(MOST_STEPS, PASSES * t.num_views // size))
         totals = {"loss": 0.0, "code": 0.0, "reconstruction": 0.0, "inverse": 0.0}
         for _ in range(steps):
             rows = torch.randperm(t.num_views, generator=self.generator)[:size].to(self.device)
