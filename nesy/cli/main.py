@@ -75,7 +75,7 @@ def _run(name: str, arguments: list[str]) -> int:
         return int(request.code or 0)
     except UserError as error:
         return _mistake(str(error))
-    signal.signal(signal.SIGTERM, _interrupt)
+    before = signal.signal(signal.SIGTERM, _interrupt)
     try:
         result = command.run(options)
         if options.json:
@@ -92,6 +92,8 @@ def _run(name: str, arguments: list[str]) -> int:
     except KeyboardInterrupt:
         print(f"nesy {name}: interrupted; the same command goes on where it stopped", file=sys.stderr)
         return 130
+    finally:
+        signal.signal(signal.SIGTERM, before)
     return 0
 
 
