@@ -30,7 +30,7 @@ from domains.person_following.paths import (
 )
 from domains.person_following.variants import Parameters
 from domains.person_following.views import configuration_of, look, relative
-from domains.person_following.world import GOAL_X, GOAL_Y
+from domains.person_following.world import BELIEVED_X, BELIEVED_Y, GOAL_X, GOAL_Y
 
 PENDING_NONE, PENDING_LEFT, PENDING_RIGHT = 0, 1, 2
 NEVER = 1 << 30
@@ -72,16 +72,20 @@ def person_chains(grids: NDArray[np.uint8], parameters: Parameters) -> list[Pers
     batch.begin_worlds(np.repeat(grids, count, axis=0), np.tile(np.arange(count), len(grids)))
     world = batch.world
     first_grids = world.grid.copy()
-    people, goals, grids_now = [world.person[:, :3].copy()], [world.person[:, [GOAL_X, GOAL_Y]]], [first_grids]
+    places, beliefs = [GOAL_X, GOAL_Y], [BELIEVED_X, BELIEVED_Y]
+    people, goals, grids_now = [world.person[:, :3].copy()], [world.person[:, places]], [first_grids]
+    # A person may pass its goal without knowing that this is the place; it arrives where it also believes so.
+    informed = [(world.person[:, beliefs] == goals[0]).all(axis=1)]
     stay = np.full(batch.num_envs, STAY, np.int64)
     arrived = np.zeros(batch.num_envs, np.bool_)
     for _ in range(16 * parameters.size**2):
-        arrived |= (people[-1][:, :2] == goals[-1]).all(axis=1)
+        arrived |= (people[-1][:, :2] == goals[-1]).all(axis=1) & informed[-1]
         if arrived.all():
             break
         batch.step(stay, False)
         people.append(world.person[:, :3].copy())
-        goals.append(world.person[:, [GOAL_X, GOAL_Y]])
+        goals.append(world.person[:, places])
+        informed.append((world.person[:, beliefs] == goals[-1]).all(axis=1))
         if parameters.goal_moves_at:
             grids_now.append(world.grid.copy())
     else:
@@ -89,11 +93,14 @@ def person_chains(grids: NDArray[np.uint8], parameters: Parameters) -> list[Pers
     chains = []
     for i in range(batch.num_envs):
         there = [bool((p[i, :2] == g[i]).all()) for p, g in zip(people, goals, strict=True)]
-        route = np.array([p[i] for p in people[: there.index(True) + 1]], np.int64)
+        arrival = next(t for t, here in enumerate(there) if here and informed[t][i])
+        route = np.array([p[i] for p in people[: arrival + 1]], np.int64)
         moved = [t for t, grid in enumerate(grids_now) if (grid[i] != first_grids[i]).any()]
         after = grids_now[moved[0]][i] if moved else first_grids[i]
         ends = np.array([goals[0][i], goals[-1][i]], np.int64)
-        chains.append(chain_of(first_grids[i], after, ends, moved[0] if moved else NEVER, i % count, route, parameters))
+        chains.append(
+            chain_of(first_grids[i], after, ends, moved[0] if moved else NEVER, i % count, route, parameters, there)
+        )
     return chains
 
 
@@ -105,8 +112,12 @@ def chain_of(
     own: int,
     route: NDArray[np.int64],
     parameters: Parameters,
+    there: list[bool] | None = None,
 ) -> PersonChain:
-    """The chain of a person that walks a route [L + 1, 3] to its goal."""
+    """The chain of a person that walks a route [L + 1, 3] to its goal.
+
+    `there` says at which steps of the route it stands where its goal is; by default at the last one only.
+    """
     size, length = len(grid), len(route) - 1
     person = route.tolist()
     successors = [(k + 1, k + 1) for k in range(length)]
@@ -138,6 +149,9 @@ def chain_of(
     view = np.empty((1, parameters.view_size, parameters.view_size), np.uint8)
     see_through = parameters.see_through_walls
     tables = (distance, configuration, moves)
+    at_goal = np.arange(len(people)) >= length
+    if there is not None:
+        at_goal[: length + 1] |= there[: length + 1]
     scratch = allocate_scratch(size)
     _fill(grid[None], poses, pose_index, people, parameters.heading_rule, see_through, view, *tables, scratch)
     return PersonChain(
@@ -149,7 +163,7 @@ def chain_of(
         poses,
         pose_index,
         people,
-        np.arange(len(people)) >= length,
+        at_goal,
         np.array(successors, np.int64),
         length,
         *tables,

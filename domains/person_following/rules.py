@@ -150,8 +150,7 @@ def _judge(rules, robot, person, out):  # type: ignore[no-untyped-def]
         seen = configurations[b] > 0
         px, py, x, y = person[b, X], person[b, Y], robot[b, X], robot[b, Y]
         at_goal = px == person[b, GOAL_X] and py == person[b, GOAL_Y]
-        if at_goal:
-            robot[b, AT_GOAL] += 1
+        robot[b, AT_GOAL] = robot[b, AT_GOAL] + 1 if at_goal else 0
         reward = 1.0 - 0.9 * (robot[b, TIME] / max_steps) if entered[b] else 0.0
         if acted[b] == FORWARD:
             heading = robot[b, HEADING]

@@ -100,4 +100,5 @@ def _told_at(chain: PersonChain, k: int, parameters: Parameters) -> PersonChain:
         chain.own,
         np.array(route, np.int64),
         parameters,
+        [(cx, cy) == (goal_x, goal_y) for cx, cy, _ in route] if k >= chain.moved_at else None,
     )

@@ -201,7 +201,7 @@ class Reference:
 
         d, sees = self.distance(), self.configuration() != 0
         at_goal = self.person[:2] == self.goal
-        self.at_goal += at_goal
+        self.at_goal = self.at_goal + 1 if at_goal else 0
         front = (self.agent[0] + STEPS[self.agent[2]][0], self.agent[1] + STEPS[self.agent[2]][1])
         if action == FORWARD and self.person[:2] == front:
             reward -= 0.01
