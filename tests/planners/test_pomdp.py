@@ -1,0 +1,155 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from domains.classic import rocksample, tiger
+from nesy.errors import UserError
+from planners.point_based import solve
+from planners.pomdp import TabularPOMDP
+
+TIGER_FILE = """
+# the tiger, in the compact form of the literature
+discount: 0.95
+values: reward
+states: tiger-left tiger-right
+actions: listen open-left open-right
+observations: hear-left hear-right
+start: uniform
+T: listen
+identity
+T: open-left
+uniform
+T: open-right
+uniform
+O: listen
+0.85 0.15
+0.15 0.85
+O: open-left
+uniform
+O: open-right
+uniform
+R: listen : * : * : * -1
+R: open-left : tiger-left : * : * -100
+R: open-left : tiger-right : * : * 10
+R: open-right : tiger-left : * : * 10
+R: open-right : tiger-right : * : * -100
+"""
+
+
+def _same(first: TabularPOMDP, second: TabularPOMDP) -> None:
+    for ours, theirs in zip(first.transition, second.transition, strict=True):
+        assert np.allclose(ours.toarray(), theirs.toarray())
+    assert np.allclose(first.observation, second.observation)
+    assert np.allclose(first.reward, second.reward)
+    assert np.allclose(first.start, second.start)
+    assert np.array_equal(first.terminal, second.terminal)
+    assert first.discount == second.discount
+
+
+def _random(seed: int) -> TabularPOMDP:
+    rng = np.random.default_rng(seed)
+    num_states, num_actions, num_observations = rng.integers(1, 5), rng.integers(1, 4), rng.integers(1, 4)
+    return TabularPOMDP(
+        states=[f"s{i}" for i in range(num_states)],
+        actions=[f"a{i}" for i in range(num_actions)],
+        observations=[f"o{i}" for i in range(num_observations)],
+        transition=[rng.dirichlet(np.ones(num_states), num_states) for _ in range(num_actions)],
+        observation=rng.dirichlet(np.ones(num_observations), (num_actions, num_states)),
+        reward=rng.normal(0, 5, (num_actions, num_states)),
+        discount=0.6,
+        start=rng.dirichlet(np.ones(num_states)),
+        terminal=np.zeros(num_states, np.bool_),
+    )
+
+
+def test_tiger_is_certified() -> None:
+    certificate = solve(TabularPOMDP(**tiger()), gap=1e-3, time_limit=60)
+    assert certificate.lower == pytest.approx(19.371, abs=2e-3)
+    assert certificate.lower <= 19.3714 <= certificate.upper + 1e-6
+    assert certificate.upper - certificate.lower <= 1e-3
+    assert certificate.action(np.array([0.5, 0.5])) == 0
+    assert certificate.action(np.array([0.99, 0.01])) == 2
+
+
+def test_rocksample_shape() -> None:
+    model = TabularPOMDP(**rocksample(4, 4))
+    assert len(model.states) == 257
+    assert model.terminal.sum() == 1
+    assert model.fully_observed.max(axis=0) @ model.start == pytest.approx(23.1, abs=5.0)
+    with pytest.raises(ValueError, match="layouts are known"):
+        rocksample(3, 2)
+
+
+def test_compact_file_is_the_built_in_tiger(tmp_path: Path) -> None:
+    path = tmp_path / "tiger.pomdp"
+    path.write_text(TIGER_FILE)
+    _same(TabularPOMDP.from_file(path), TabularPOMDP(**tiger()))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_written_and_read_again(tmp_path: Path, seed: int) -> None:
+    model = _random(seed)
+    model.to_file(tmp_path / "m.pomdp")
+    _same(TabularPOMDP.from_file(tmp_path / "m.pomdp"), model)
+
+
+def test_rows_numbers_costs_and_start_forms(tmp_path: Path) -> None:
+    base = "discount: 0.5\nvalues: cost\nstates: 3\nactions: go\nobservations: 2\n"
+    tables = "T: * : * uniform\nT: go : 0 \n0 1 0\nT: 0 : 1 : 2 1.0\nT: 0 : 1 : 0 0\nT: 0 : 1 : 1 0\nO: * \nuniform\n"
+    rewards = "R: go : 0\n 1 1\n 2 4\n 0 0\nR: go : 1 : 2\n 6 8\n"
+    path = tmp_path / "m.pomdp"
+    for start, wanted in (
+        ("start: 1 0 0", [1, 0, 0]),
+        ("start: 2", [0, 0, 1]),
+        ("start include: 0 2", [0.5, 0, 0.5]),
+        ("start exclude: 0", [0, 0.5, 0.5]),
+        ("start: 0.25 0.5 0.25", [0.25, 0.5, 0.25]),
+    ):
+        path.write_text(f"{base}{start}\n{tables}{rewards}")
+        model = TabularPOMDP.from_file(path)
+        assert model.start.tolist() == wanted
+        assert model.reward[0].tolist() == [-3.0, -7.0, 0.0]
+        assert model.transition[0].toarray()[1].tolist() == [0, 0, 1]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("0.85 0.15\n", "0.85 0.25\n"), "sum to 1.1, not 1"),
+        (("T: listen\n", "T: lisen\n"), "line 9: unknown action 'lisen'"),
+        (("discount: 0.95", "discount: high"), "line 3: expected a number, found 'high'"),
+        (("states: tiger-left tiger-right\n", ""), "'start' comes before 'states:'"),
+        ((": * -1\n", ":"), "unknown observation"),
+    ],
+)
+def test_mistakes_in_files_are_named_with_their_line(tmp_path: Path, change: tuple[str, str], message: str) -> None:
+    path = tmp_path / "bad.pomdp"
+    path.write_text(TIGER_FILE.replace(*change, 1))
+    with pytest.raises(UserError, match=r"bad\.pomdp") as caught:
+        TabularPOMDP.from_file(path)
+    assert message in str(caught.value)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**31))
+def test_bounds_hold_and_beliefs_are_bayes_on_random_models(seed: int) -> None:
+    model = _random(seed)
+    certificate = solve(model, gap=0.05, time_limit=5.0, max_trials=60)
+    assert certificate.lower <= certificate.upper + 1e-6
+    assert certificate.upper <= model.fully_observed.max(axis=0) @ model.start + 1e-6
+    chances = model.observation_chances(model.start, 0)
+    assert chances.sum() == pytest.approx(1.0)
+    mixture = sum(p * model.update(model.start, 0, o) for o, p in enumerate(chances) if p > 1e-9)
+    assert np.allclose(mixture, model.predict(model.start, 0), atol=1e-6)
+
+
+def test_terminal_states_must_be_terminal() -> None:
+    arrays = tiger()
+    arrays["terminal"] = np.array([True, False])
+    with pytest.raises(UserError, match="leaves a terminal state"):
+        TabularPOMDP(**arrays)
