@@ -222,7 +222,8 @@ class KnowledgeBase:
         found = after(self.dbn, self._book(), np.asarray(start), actions)
         likely = sorted(found.can.items(), key=lambda item: -item[1])[:MOST_LINES]
         text = (
-            f"{found.codes} outcomes are possible (a row lost at most {found.dropped:.2g}).\n"
+            f"{found.codes} outcomes are possible "
+            f"(values below {found.least:g} left out: at most {found.dropped:.2g} of a row).\n"
             f"  must hold: {', '.join(found.must) or 'nothing'}\n"
             f"  can hold: {', '.join(f'{name} ({p:.3f})' for name, p in likely) or 'nothing else'}\n"
             f"  cannot hold: {len(found.cannot)} predicates"

@@ -128,7 +128,8 @@ def _meaning_text(name: str, rows: Sequence[dict[str, Any]], views: int) -> str:
                 f"in {100 * row['of_all_views']:.1f} % of all views"
             )
         if len(chosen) > MOST_LINES:
-            lines.append(f"  ... and {len(chosen) - MOST_LINES} predicates more that {words[relation]}")
+            more = "hold" if relation == "means" else "do not hold"
+            lines.append(f"  ... and {len(chosen) - MOST_LINES} more predicates that {more}")
     mixed = [r for r in rows if r["relation"] == "mixed"][:3]
     if len(lines) == 1:
         lines.append("  no predicate is decided by this value alone; the nearest:")

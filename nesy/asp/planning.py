@@ -23,6 +23,7 @@ from nesy.errors import UserError
 
 MAX_CODES = 20_000
 MAX_OUTCOMES = 50_000
+HOPE = 0.01
 SAMPLES = 20_000
 
 
@@ -101,8 +102,12 @@ def find_plan(
     rules: Sequence[str | Path] = (),
     most_probable: bool = False,
     time_limit: float = 10.0,
+    optimistic: bool = False,
 ) -> Plan:
     """The shortest plan of most probable outcomes to a goal.
+
+    With `optimistic`, an action may have any outcome that is at least 0.01 probable (among the 16 most probable):
+    together with `most_probable` that is the most probable trajectory to the goal of the least length.
 
     Args:
         dbn: the model.
@@ -113,6 +118,7 @@ def find_plan(
         rules: the user's constraints on do(A,T), at(C,T), now(C,P), in rule files or as text.
         most_probable: of the shortest plans, the one whose outcomes are most probable (instead of any).
         time_limit: seconds for each length tried, where there are rules.
+        optimistic: whether outcomes other than the most probable one may be hoped for.
 
     Raises:
         UserError: a wrong condition or rule, or more than 20,000 codes are reachable.
@@ -121,90 +127,108 @@ def find_plan(
     if not literals:
         raise UserError("a plan needs a goal")
     truth = PredicateTruth(codebook) if codebook is not None and len(codebook) else None
-    codes, successors, weights, distance = _reachable(dbn, start, max_steps, truth)
+    codes, moves, distance = _reachable(dbn, start, max_steps, truth, optimistic)
     good = satisfied(literals, codes, truth)
+    left = _steps_left(moves, good, max_steps)
     sources = read_sources(list(rules))
     first = int(distance[good].min(initial=max_steps + 1))
     lengths = range(first, max_steps + 1)
     for horizon in lengths if sources or first <= max_steps else ():
-        found = _solve(
-            dbn, codes, successors, weights, distance, good, horizon, sources, most_probable, truth, time_limit
-        )
+        useful = [m for m in moves if distance[m.source] + 1 + left[m.target] <= horizon]
+        found = _solve(dbn, codes, useful, good, horizon, sources, most_probable, truth, time_limit)
         if found is not None:
             actions, path = found
             lost, goal_probability, exact = _goal_probability(dbn, start, actions, literals, truth)
-            steps = zip(path, actions, strict=False)
-            probability = math.prod(float(weights[c, a]) for c, a in steps)
+            chance = {(m.source, m.action, m.target): m.probability for m in moves}
+            steps = zip(path, actions, path[1:], strict=False)
+            probability = math.prod(chance[step] for step in steps)
             names = tuple(dbn.action_names[a] for a in actions)
             chain = tuple(tuple(int(v) for v in codes[c]) for c in path)
             return Plan(names, chain, probability, goal_probability, exact, lost, True)
     return Plan(None, (), 0.0, 0.0, True, 0.0, True)
 
 
+@dataclass(frozen=True)
+class _Move:
+    """A step between two codes, by their numbers."""
+
+    source: int
+    action: int
+    target: int
+    probability: float
+
+
+def _steps_left(moves: Sequence[_Move], good: np.ndarray, max_steps: int) -> np.ndarray:
+    """Fewest steps from each code to a good one; max_steps + 1 where there is no way."""
+    left = np.where(good, 0, max_steps + 1)
+    sources = np.array([m.source for m in moves], dtype=np.int64)
+    targets = np.array([m.target for m in moves], dtype=np.int64)
+    for _ in range(max_steps if len(moves) else 0):
+        before = left.copy()
+        np.minimum.at(left, sources, before[targets] + 1)
+        if (left == before).all():
+            break
+    return left
+
+
 def _reachable(
-    dbn: TwoSliceDBN, start: np.ndarray, max_steps: int, truth: PredicateTruth | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Codes that most probable outcomes lead to within some steps.
+    dbn: TwoSliceDBN, start: np.ndarray, max_steps: int, truth: PredicateTruth | None, optimistic: bool
+) -> tuple[np.ndarray, list[_Move], np.ndarray]:
+    """Codes and moves that most probable (or hoped for) outcomes lead to within some steps.
 
     Where it is known which codes were met, the most probable outcome is the most probable of those, and a code
     that was not met is a dead end: its rows are guesses.
 
     Returns:
-        uint8 [C, N] (the start first), successors int64 [C, A] (-1: not looked at), their probabilities, and the
-        number of steps to each code.
+        uint8 [C, N] (the start first), the moves, and the number of steps to each code.
     """
     codes = dbn._codes(start)[None].astype(np.uint8)
-    distance = np.zeros(1, dtype=np.int64)
-    successors = np.full((1, dbn.num_actions), -1, dtype=np.int64)
-    weights = np.zeros((1, dbn.num_actions))
-    edge = np.array([0])
+    number = {bytes(codes[0]): 0}
+    distance, moves = [0], []
+    edge = [0]
     for step in range(1, max_steps + 1):
-        if not len(edge):
+        if not edge:
             break
-        outcomes = [_outcome(dbn, codes[edge], a, truth) for a in range(dbn.num_actions)]
-        later = np.concatenate([code for code, _ in outcomes])
-        first, index, _ = unique_rows(np.concatenate([codes, later]))
-        # codes keep their numbers: `first` is the earliest occurrence only if it lies among them
-        number = np.full(len(first), -1, dtype=np.int64)
-        number[index[: len(codes)]] = np.arange(len(codes))
-        new = np.flatnonzero(number < 0)
-        number[new] = len(codes) + np.arange(len(new))
-        example = np.zeros(len(first), dtype=np.int64)
-        example[index[len(codes) :]] = np.arange(len(later))
-        successors[edge] = number[index[len(codes) :]].reshape(dbn.num_actions, -1).T
-        weights[edge] = np.stack([weight for _, weight in outcomes], axis=1)
-        if not len(new):
+        new: list[np.ndarray] = []
+        for a in range(dbn.num_actions):
+            for source, later, weight in _outcomes(dbn, codes[edge], a, truth, optimistic):
+                key = bytes(later)
+                if key not in number:
+                    number[key] = len(codes) + len(new)
+                    new.append(later)
+                moves.append(_Move(edge[source], a, number[key], float(weight)))
+        if not new:
             break
-        added = later[example[new]]
+        added = np.stack(new)
         met = np.ones(len(new), dtype=bool) if truth is None else truth.knows(added)
-        edge = len(codes) + np.flatnonzero(met)
+        edge = (len(codes) + np.flatnonzero(met)).tolist()
         codes = np.concatenate([codes, added])
+        distance += [step] * len(new)
         if len(codes) > MAX_CODES:
             raise UserError(f"more than {MAX_CODES} codes can be reached in {step} steps; lower max_steps")
-        distance = np.concatenate([distance, np.full(len(new), step)])
-        successors = np.concatenate([successors, np.full((len(new), dbn.num_actions), -1)])
-        weights = np.concatenate([weights, np.zeros((len(new), dbn.num_actions))])
-    return codes, successors, weights, distance
+    return codes, moves, np.array(distance)
 
 
-def _outcome(
-    dbn: TwoSliceDBN, codes: np.ndarray, action: int, truth: PredicateTruth | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """The most probable next code, of those met where that is known and one of them is likely at all."""
+def _outcomes(
+    dbn: TwoSliceDBN, codes: np.ndarray, action: int, truth: PredicateTruth | None, optimistic: bool
+) -> list[tuple[int, np.ndarray, float]]:
+    """(index of the code, next code, probability) of the outcomes that count."""
     later, weights = likely_next(dbn, codes, action)
-    choice = np.zeros(len(codes), dtype=np.int64)
+    known = np.ones(weights.shape, dtype=bool)
     if truth is not None:
-        choice = truth.knows(later.reshape(-1, later.shape[2])).reshape(weights.shape).argmax(axis=1)
-    number = np.arange(len(codes))
-    return later[number, choice], weights[number, choice]
+        known = truth.knows(later.reshape(-1, later.shape[2])).reshape(weights.shape)
+    # the most probable one that was met, or the most probable at all
+    chosen = np.zeros(weights.shape, dtype=bool)
+    chosen[np.arange(len(codes)), known.argmax(axis=1)] = True
+    if optimistic:
+        chosen |= known & (weights >= HOPE)
+    return [(int(b), later[b, w], float(weights[b, w])) for b, w in zip(*np.nonzero(chosen), strict=True)]
 
 
 def _solve(
     dbn: TwoSliceDBN,
     codes: np.ndarray,
-    successors: np.ndarray,
-    weights: np.ndarray,
-    distance: np.ndarray,
+    moves: Sequence[_Move],
     good: np.ndarray,
     horizon: int,
     sources: list[Source],
@@ -214,12 +238,11 @@ def _solve(
 ) -> tuple[list[int], list[int]] | None:
     facts = Facts(dbn, None)
     lines = [f"horizon({horizon}).", "start(0)."] + [f"goal({c})." for c in np.flatnonzero(good).tolist()]
-    for c, a in zip(*(index.tolist() for index in np.nonzero(successors >= 0)), strict=True):
-        if distance[c] < horizon:
-            lines.append(f"succ({c},{facts.actions[a]},{successors[c, a]}).")
-            if most_probable:
-                cost = round(-1000 * math.log(max(float(weights[c, a]), 1e-12)))
-                lines.append(f"cost({c},{facts.actions[a]},{cost}).")
+    for m in moves:
+        lines.append(f"succ({m.source},{facts.actions[m.action]},{m.target}).")
+        if most_probable:
+            cost = round(-1000 * math.log(max(m.probability, 1e-12)))
+            lines.append(f"cost({m.source},{facts.actions[m.action]},{m.target},{cost}).")
     if sources and truth is not None:
         holds, _ = truth.of(codes)
         names = [asp_name(name) for name in truth.codebook.predicate_names]
@@ -278,18 +301,30 @@ class Aftermath:
     """Number of possible outcomes."""
     unknown: float
     """Probability of outcomes that are no code met in experience: nothing is known about their predicates."""
+    least: float
+    """Values of a row less probable than this were taken as impossible."""
     dropped: float
-    """Values of a row below 0.001 were taken as impossible: the most that a row lost by that."""
+    """The most that a row lost by that."""
 
 
 def after(dbn: TwoSliceDBN, codebook: Codebook, start: np.ndarray, plan: Sequence[int]) -> Aftermath:
     """What must, can and cannot hold after a plan.
 
+    Values less probable than 0.001 are taken as impossible; where that leaves too many outcomes, those less probable
+    than 0.01, or than 0.05. The result says which, and how much a row lost by it.
+
     Raises:
-        UserError: more than 2 million codes are possible.
+        UserError: more than 50,000 outcomes are possible even so.
     """
-    model, lost = pruned(dbn, LEAST)
-    codes, weights = follow(model, start, plan)
+    for least in (LEAST, 10 * LEAST, 50 * LEAST):
+        model, lost = pruned(dbn, least)
+        try:
+            codes, weights = follow(model, start, plan, most=MAX_OUTCOMES)
+        except UserError:
+            if least == 50 * LEAST:
+                raise
+        else:
+            break
     holds, fails = PredicateTruth(codebook).of(codes)
     known = (holds | fails).any(axis=1)
     probability = weights @ holds
@@ -301,4 +336,4 @@ def after(dbn: TwoSliceDBN, codebook: Codebook, start: np.ndarray, plan: Sequenc
             cannot.append(name)
         else:
             can[name] = float(probability[p])
-    return Aftermath(tuple(must), tuple(cannot), can, len(codes), float(weights[~known].sum()), lost)
+    return Aftermath(tuple(must), tuple(cannot), can, len(codes), float(weights[~known].sum()), least, lost)

@@ -24,6 +24,7 @@ def plan_validity(
     max_steps: int = 8,
     variant: str = "paper",
     seed: int = 0,
+    **options: Any,
 ) -> dict[str, Any]:
     """Plan to a predicate from real views, execute the plans blindly, and look whether the predicate holds.
 
@@ -38,6 +39,7 @@ def plan_validity(
         max_steps: longest plan looked for.
         variant: of the domain.
         seed: of maps and steps.
+        options: how plans are looked for (see nesy.asp.planning.find_plan).
 
     Returns:
         `episodes`; `known`: the view was met in experience; of those `found`: there was a plan, `exhausted`: the
@@ -65,7 +67,7 @@ def plan_validity(
     of_view = place[index[len(book) :]]
     plans: dict[int, list[int]] = {}
     for b in np.flatnonzero(of_view >= 0).tolist():
-        found = find_plan(base.dbn, book, book.codes[of_view[b]], goal, max_steps)
+        found = find_plan(base.dbn, book, book.codes[of_view[b]], goal, max_steps, **options)
         if found.actions is not None:
             plans[b] = [base.dbn.action_names.index(name) for name in found.actions]
     stay = base.dbn.action_names.index("stay")

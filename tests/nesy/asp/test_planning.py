@@ -55,6 +55,19 @@ def test_most_probable_of_the_shortest_plans():
     assert plan.actions == ("a1",) and plan.path_probability == pytest.approx(0.9)
 
 
+def test_the_most_probable_trajectory_may_count_on_improbable_outcomes():
+    from nesy.dbn.model import TwoSliceDBN
+
+    # from 0, action 0 leads to 2 now and then, action 1 more often; the most probable outcome of both is 0
+    rows = [np.array([[0.9, 0.0, 0.1], [0, 1, 0], [0, 0, 1]]), np.array([[0.7, 0.0, 0.3], [0, 1, 0], [0, 0, 1]])]
+    dbn = TwoSliceDBN.from_tables([[rows[0]], [rows[1]]], [[[0]], [[0]]])
+    assert find_plan(dbn, None, np.array([0]), "X0=2").actions is None
+    plan = find_plan(dbn, None, np.array([0]), "X0=2", optimistic=True, most_probable=True)
+    assert plan.actions == ("a1",) and plan.path_probability == pytest.approx(0.3)
+    assert plan.goal_probability == pytest.approx(0.3)
+    assert find_plan(dbn, None, np.array([0]), "X0=1", optimistic=True).actions is None
+
+
 def test_the_user_s_rules_constrain_the_plan(tmp_path):
     dbn, codebook = toy()
     start = np.array([0, 1, 0])
