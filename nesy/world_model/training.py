@@ -25,6 +25,7 @@ from nesy.run_folder import write_json
 from nesy.world_model.codec import SymbolicCodec
 from nesy.world_model.distinct import Transitions, reference_transitions, transitions_of, with_mirror
 from nesy.world_model.gates import evaluate
+from nesy.world_model.imagination import imagined_rollouts
 from nesy.world_model.logs import MetricsLog
 from nesy.world_model.paper_training import PaperTrainer
 from nesy.world_model.readability import readability
@@ -63,8 +64,8 @@ def train(
     Returns:
         The gates with the limits of the data beside them (see `gates.evaluate`): views of all kinds, transitions
         of the crossing task; `following`, the same for the transitions of the following task; `held_out`, figures
-        from before any held-out map was learned from; `readability` (details in readability.json); `epochs`, `seconds`,
-        `architecture`.
+        from before any held-out map was learned from; `rollouts`, the likeliest view after 1 to 8
+        imagined steps; `readability` (details in readability.json); `epochs`, `seconds`, `architecture`.
 
     Raises:
         UserError: impossible settings, or no experience.
@@ -118,6 +119,7 @@ def _train(
         **evaluate(codec, references.get("crossing", everything), everything.views),
         **({"following": evaluate(codec, references["following"])} if references else {}),
         "held_out": trainer.held_out_figures,
+        "rollouts": imagined_rollouts(codec, experience, np.random.default_rng(seed)),
         "architecture": config.architecture,
         "epochs": tick,
         "seconds": round(elapsed, 2),
