@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from fractions import Fraction
 
 import numpy as np
@@ -30,6 +31,9 @@ def all_maps(parameters: Parameters) -> tuple[NDArray[np.uint8], NDArray[np.floa
     places = range(2, size - 2, 2)
     rivers = [("v", place) for place in places] + [("h", place) for place in places]
     found: dict[bytes, Fraction] = {}
+    too_many = DomainError(f"size {size} with {crossings} crossings has more than {MAX_MAPS} maps: too many to list")
+    if math.comb(len(rivers), crossings) > MAX_MAPS:
+        raise too_many
     subsets = list(itertools.combinations(rivers, crossings))
     combinations = 0
     for subset in subsets:
@@ -37,15 +41,19 @@ def all_maps(parameters: Parameters) -> tuple[NDArray[np.uint8], NDArray[np.floa
         horizontal = sorted(place for kind, place in subset if kind == "h")
         base = _walls(size, vertical, horizontal)
         limits_x, limits_y = [0, *vertical, size - 1], [0, *horizontal, size - 1]
-        orders = set(itertools.permutations([True] * len(vertical) + [False] * len(horizontal)))
+        steps = len(vertical) + len(horizontal)
+        if math.comb(steps, len(vertical)) > MAX_MAPS:
+            raise too_many
+        orders = [
+            tuple(k in places_of_right for k in range(steps))
+            for places_of_right in itertools.combinations(range(steps), len(vertical))
+        ]
         for order in orders:
             choices = _openings(order, limits_x, limits_y)
-            number = int(np.prod([len(cells) for cells in choices], dtype=np.int64))
+            number = math.prod(len(cells) for cells in choices)
             combinations += number
             if combinations > MAX_MAPS:
-                raise DomainError(
-                    f"size {size} with {crossings} crossings has more than {MAX_MAPS} maps: too many to list"
-                )
+                raise too_many
             share = Fraction(1, len(subsets) * len(orders) * number)
             for openings in itertools.product(*choices):
                 grid = base.copy()

@@ -103,8 +103,8 @@ class FullStatePolicy:
         if batch.parameters != self._parameters:
             raise DomainError("the environment's parameters are not those that this optimum was solved for")
         world: World = batch.world
-        actions = np.empty(env.num_envs, np.int64)
-        for b in range(env.num_envs):
+        actions = np.empty(batch.num_envs, np.int64)
+        for b in range(batch.num_envs):
             i = self._index.get((int(world.map_id[b]), int(world.person[b, OWN])))
             if i is None:
                 raise DomainError("the environment plays a map that this optimum was not solved for")

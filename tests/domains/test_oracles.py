@@ -152,7 +152,9 @@ def test_oracles_refuse_what_they_do_not_cover():
     with pytest.raises(DomainError, match="goal_moves_at"):
         domain.optimum("false_belief", size=7, num_crossings=1, look_back=True)
     with pytest.raises(DomainError, match="too many"):
-        domain.maps(size=31, num_crossings=8)
+        domain.maps(size=31, num_crossings=14)
+    with pytest.raises(DomainError, match="too many"):
+        domain.maps(size=31, num_crossings=28)
     with pytest.raises(DomainError, match="discount"):
         domain.optimum(discount=1.5)
     with pytest.raises(DomainError, match="egocentric"):
