@@ -125,3 +125,28 @@ def test_numbers_may_be_written_as_integers(tmp_path: Path) -> None:
     settings["train"]["kl_weight"] = 1
     path.write_text(json.dumps(settings))
     assert configuration.load(path).train.kl_weight == 1.0
+
+
+@pytest.mark.parametrize("agent", ["random", "goal", "follower", "optimum"])
+def test_play_records_an_episode(agent: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    from PIL import Image
+
+    film = tmp_path / "episode.gif"
+    assert main(["play", "--agent", agent, "--seed", "3", "--record", str(film), "--json"]) == 0
+    episode = json.loads(capsys.readouterr().out)["episodes"][0]
+    with Image.open(film) as pictures:
+        assert pictures.n_frames <= episode["length"] + 1  # equal frames in a row are stored once
+        assert pictures.n_frames > 1
+
+
+def test_play_tells_what_is_wrong(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    for arguments, expected in (
+        (["--agent", "random", "--record", str(tmp_path / "x.avi")], ".gif or .mp4"),
+        (["--agent", "random", "--size", "8"], "odd"),
+        (["--agent", "random", "--variant", "none"], "unknown variant"),
+        (["--agent", "random", "--episodes", "0"], "at least one"),
+        ([], "needs a terminal"),
+    ):
+        assert main(["play", *arguments]) == 2
+        assert expected in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
