@@ -5,17 +5,19 @@ percepts (x, b, b~, configuration), the last actions  ->  actions [B]
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
 from domains.core import BatchedEnvironment, ViewGeometry
 from planners.beliefs import ParticleBelief
 from planners.config import SearchConfig
-from planners.dqn import DQNPolicy
 from planners.ialm import IALM
 from planners.kernels import compile_model
 from planners.perception import Percepts
+
+if TYPE_CHECKING:
+    from planners.dqn import DQNPolicy  # imports torch
 
 
 class Situation(NamedTuple):

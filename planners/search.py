@@ -2,9 +2,10 @@
 
     plan(b) -> (argmax_a Q(b, a), info); Q estimated by simulations s ~ b through a tree of (action, observation)
 
-A leaf is worth what the model says of the sampled state: between always doing the best single action (lower) and
-the fully observed process (upper), never a uniform rollout. The person-following model has a search of its own
-(planners.ialm_search) on the same tree. Source: Silver and Veness 2010.
+Values are backed up as maxima (Bellman) rather than as averages of what was tried. A leaf is worth what the model
+says of the sampled state: between always doing the best single action (lower) and the fully observed process
+(upper), never a uniform rollout. The person-following model has a search of its own (planners.ialm_search) on the
+same tree. Source: Silver and Veness 2010.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import numpy as np
 from nesy.compiled import njit
 from planners.pomdp import TabularPOMDP
 from planners.random_bits import stream, uniform
-from planners.tree import Tree, allocate, backup, best_by_ucb, clear, find_child
+from planners.tree import Tree, allocate, backup_best, best_by_ucb, clear, find_child
 
 _CHUNK = 256  # simulations between two looks at the clock
 
@@ -194,8 +195,15 @@ def _simulate(
     everything = np.ones(allowed.shape[0], np.bool_)
     last = model.observation.shape[2] - 1
     for _ in range(count):
-        drawn = np.searchsorted(cumulative, uniform(bits), side="right")
-        state = support[min(drawn, support.shape[0] - 1)]
+        number = uniform(bits)
+        low, high = 0, support.shape[0] - 1
+        while low < high:
+            half = (low + high) // 2
+            if number < cumulative[half]:
+                high = half
+            else:
+                low = half + 1
+        state = support[low]
         node, length, value = 0, 0, 0.0
         while length < depth and not model.terminal[state]:
             action = best_by_ucb(tree, node, exploration, allowed if node == 0 else everything)
@@ -216,6 +224,7 @@ def _simulate(
                 break
         if model.terminal[state]:
             value = 0.0
-        backup(tree, nodes, actions, rewards, length, value, discount)
+        leaf = -node - 1 if -tree.size[0] <= node < 0 else -1
+        backup_best(tree, nodes, actions, rewards, length, leaf, value, discount)
         depths[0] += length
         depths[1] = max(depths[1], length)

@@ -25,6 +25,8 @@ class Tree(NamedTuple):
         visits: int64 [capacity].
         q_visits: int64 [capacity, A].
         q_value: float64 [capacity, A], mean return of the action.
+        value: float64 [capacity], value of the node (`backup_best`): its leaf's, then that of its best action.
+        gained, future: float64 [capacity, A], sums of rewards and of the values that followed (`backup_best`).
         depth: int32 [capacity], depth of the node below the root it was made under.
         key, owner, child: the hash table: observation, node * A + action (-1 if empty), node reached.
     """
@@ -33,6 +35,9 @@ class Tree(NamedTuple):
     visits: np.ndarray
     q_visits: np.ndarray
     q_value: np.ndarray
+    value: np.ndarray
+    gained: np.ndarray
+    future: np.ndarray
     depth: np.ndarray
     key: np.ndarray
     owner: np.ndarray
@@ -46,6 +51,9 @@ def allocate(capacity: int, num_actions: int) -> Tree:
         np.ones(1, np.int64),
         np.zeros(capacity, np.int64),
         np.zeros((capacity, num_actions), np.int64),
+        np.zeros((capacity, num_actions)),
+        np.zeros(capacity),
+        np.zeros((capacity, num_actions)),
         np.zeros((capacity, num_actions)),
         np.zeros(capacity, np.int32),
         np.zeros(slots, np.int64),
@@ -64,6 +72,8 @@ def clear(tree: Tree) -> None:
         for a in range(tree.q_value.shape[1]):
             tree.q_visits[node, a] = 0
             tree.q_value[node, a] = 0.0
+            tree.gained[node, a] = 0.0
+            tree.future[node, a] = 0.0
     for slot in range(tree.owner.shape[0]):
         tree.owner[slot] = -1
     tree.size[0] = 1
@@ -132,3 +142,39 @@ def backup(
         tree.q_visits[node, action] += 1
         tree.q_value[node, action] += (value - tree.q_value[node, action]) / tree.q_visits[node, action]
     return value
+
+
+@njit(cache=True)
+def backup_best(
+    tree: Tree,
+    nodes: np.ndarray,
+    actions: np.ndarray,
+    rewards: np.ndarray,
+    length: int,
+    leaf: int,
+    leaf_value: float,
+    discount: float,
+) -> None:
+    """Add one simulation with Bellman's backup: a node is worth its best action, not what was tried on average.
+
+    `leaf` is the node that the simulation made, or -1 where it ended without making one (at the end of an episode,
+    the greatest depth, or in a full tree); `leaf_value` is what followed.
+    """
+    before, after = 0.0, leaf_value  # visits times value of the child, before and after this simulation
+    if leaf >= 0:
+        tree.value[leaf] = leaf_value
+    for d in range(length - 1, -1, -1):
+        node, action = nodes[d], actions[d]
+        old = tree.value[node] * (tree.visits[node] + 1)
+        tree.visits[node] += 1
+        tree.q_visits[node, action] += 1
+        tree.gained[node, action] += rewards[d]
+        tree.future[node, action] += after - before
+        total = tree.gained[node, action] + discount * tree.future[node, action]
+        tree.q_value[node, action] = total / tree.q_visits[node, action]
+        best = -np.inf
+        for a in range(tree.q_value.shape[1]):
+            if tree.q_visits[node, a] > 0 and tree.q_value[node, a] > best:
+                best = tree.q_value[node, a]
+        tree.value[node] = best
+        before, after = old, best * (tree.visits[node] + 1)

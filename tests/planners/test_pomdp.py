@@ -11,6 +11,7 @@ from domains.classic import rocksample, tiger
 from nesy.errors import UserError
 from planners.point_based import solve
 from planners.pomdp import TabularPOMDP
+from planners.search import TreeSearch, closed_loop
 
 TIGER_FILE = """
 # the tiger, in the compact form of the literature
@@ -153,3 +154,28 @@ def test_terminal_states_must_be_terminal() -> None:
     arrays["terminal"] = np.array([True, False])
     with pytest.raises(UserError, match="leaves a terminal state"):
         TabularPOMDP(**arrays)
+
+
+def test_search_plays_tiger_as_the_solver_does() -> None:
+    model = TabularPOMDP(**tiger())
+    certificate = solve(model, gap=0.05, time_limit=30)
+    search = TreeSearch(model, np.random.default_rng(0), simulations=4000, depth=20)
+    for hints in range(-3, 4):  # net number of times the tiger was heard on the left
+        belief = model.start
+        for _ in range(abs(hints)):
+            belief = model.update(belief, 0, 0 if hints > 0 else 1)
+        action, info = search.plan(belief)
+        assert action == certificate.action(belief)
+        # Leaves are worth more than a belief-bound player can get, so the estimate is high, but within bounds.
+        assert (certificate.alphas @ belief).max() - 3 <= max(info["values"]) <= model.fully_observed.max()
+    returns = [closed_loop(search, 60, np.random.default_rng(seed)) for seed in range(8)]
+    assert np.mean(returns) > 0
+
+
+def test_search_repeats_and_respects_the_mask() -> None:
+    model = TabularPOMDP(**tiger())
+    plans = [TreeSearch(model, np.random.default_rng(4), simulations=500).plan(model.start) for _ in range(2)]
+    assert plans[0] == plans[1]
+    action, info = TreeSearch(model, np.random.default_rng(4)).plan(model.start, np.array([False, True, True]))
+    assert action != 0
+    assert info["visits"][0] == 0

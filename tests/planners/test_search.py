@@ -8,7 +8,7 @@ from planners import kernels
 from planners.config import SearchConfig
 from planners.ialm_search import IALMSearch
 from planners.pomdp_py_adapter import LocalEnvironment, LocalState, POUCTAgent, RobotAction, RobotAgent
-from planners.tree import allocate, backup, best_by_ucb, find_child
+from planners.tree import allocate, backup, backup_best, best_by_ucb, find_child
 from tests.planners.models import N, small_ialm
 
 START = np.array([0, 0, 0, 1, 2, 2, 3, 0, 0], np.int16)
@@ -28,11 +28,11 @@ def _optimum(depth: int) -> np.ndarray:
         for here in range(5):
             state = START.copy()
             state[2 * N + 1] = here
-            for _ in range(3000):
+            for _ in range(1000):
                 state[: 2 * N] = np.random.default_rng(int(bits[0] % 2**31)).integers(0, 2, 2 * N)
                 r, _, _ = kernels.step(compiled, state, a, after, v, bits)
-                transition[a, here, after[2 * N + 1]] += 1 / 3000
-                reward[a, here] += r / 3000
+                transition[a, here, after[2 * N + 1]] += 1 / 1000
+                reward[a, here] += r / 1000
     value = np.zeros(5)
     q = np.zeros((4, 5))
     for _ in range(depth):
@@ -121,3 +121,21 @@ def test_tree_counts_and_averages() -> None:
     assert find_child(tree, 0, 1, 1, True) == -3
     assert find_child(tree, 0, 1, 2, True) == -4
     assert find_child(tree, 0, 1, 3, True) < -1000  # full
+
+
+def test_best_backup_is_bellman_over_what_was_tried() -> None:
+    tree = allocate(8, 2)
+    nodes, actions = np.array([0, 1]), np.array([0, 0])
+    assert find_child(tree, 0, 0, 5, True) == -2
+    backup_best(tree, nodes, actions, np.array([1.0, 0.0]), 1, 1, 4.0, 0.5)
+    assert tree.q_value[0, 0] == 1.0 + 0.5 * 4.0
+    assert find_child(tree, 1, 0, 5, True) == -3
+    backup_best(tree, nodes, actions, np.array([1.0, 0.0]), 2, 2, 2.0, 0.5)
+    assert tree.value[1] == 0.5 * 2.0  # the leaf value is forgotten once the node has an action of its own
+    assert tree.q_value[0, 0] == 1.0 + 0.5 * 1.0
+    assert find_child(tree, 1, 1, 5, True) == -4
+    backup_best(tree, nodes, np.array([0, 1]), np.array([1.0, 10.0]), 2, 3, 2.0, 0.5)
+    assert tree.value[1] == 11.0
+    assert tree.q_value[0, 0] == 1.0 + 0.5 * 11.0
+    backup_best(tree, nodes, np.array([1, 0]), np.array([3.0, 0.0]), 1, -1, 0.0, 0.5)
+    assert tree.value[0] == 6.5
