@@ -157,9 +157,11 @@ class Batch:
             starts[chosen] = self.starts.of(self.world.grid[chosen])
         episodes.begin_batch(self.rules, self.world, self.store, chosen, starts, self._own, self.last)
 
-    def step(self, actions: NDArray[np.int64], autoreset: bool) -> None:
-        """Take a step everywhere; the results lie in `last`, which is new every time."""
-        self.last = last = allocate_results(self.num_envs, self.parameters.view_size)
+    def step(self, actions: NDArray[np.int64], autoreset: bool, reuse: bool = False) -> None:
+        """Take a step everywhere; the results lie in `last`, whose arrays are new unless they may be reused."""
+        if not reuse:
+            self.last = allocate_results(self.num_envs, self.parameters.view_size)
+        last = self.last
         ended = kernel.step_batch(self.rules, self.world, self.store, actions, last)
         if autoreset and ended:
             last.robot_view[:] = last.final_view

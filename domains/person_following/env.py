@@ -51,6 +51,22 @@ class PersonFollowingEnv(gymnasium.Env):
         """Coordinates of the view."""
         return self.batch.geometry
 
+    @property
+    def np_random(self) -> np.random.Generator:
+        """The environment's generator, at the place that the compiled rules have reached in its stream."""
+        if not self.batch.seeded:
+            self.np_random = np.random.default_rng()
+        if self._np_random is None:
+            self._np_random = np.random.default_rng(0)
+        write_back(self.batch.world.stream[0], self._np_random)
+        return self._np_random
+
+    @np_random.setter
+    def np_random(self, value: np.random.Generator) -> None:
+        self._np_random = value
+        self.batch.world.stream[0] = stream_of(value)
+        self.batch.seeded = True
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -68,10 +84,9 @@ class PersonFollowingEnv(gymnasium.Env):
         super().reset(seed=seed)
         if seed is not None:
             batch.seed([seed])
-        else:
-            batch.world.stream[0] = stream_of(self.np_random)
+        elif not batch.seeded:
+            self.np_random = np.random.default_rng()
         begin()
-        write_back(batch.world.stream[0], self.np_random)
         last = batch.last
         observation = {"view": last.robot_view[0].copy(), "configuration": last.configuration[0]}
         if self.render_mode == "human":
@@ -88,7 +103,7 @@ class PersonFollowingEnv(gymnasium.Env):
             self._actions[0] = action
         else:
             self._actions[:] = checked_actions(np.asarray(action).reshape(-1), 1)
-        self.batch.step(self._actions, False)
+        self.batch.step(self._actions, False, reuse=True)
         last = self.batch.last
         info: dict[str, Any] = {
             "distance": int(last.distance[0]),
@@ -99,7 +114,7 @@ class PersonFollowingEnv(gymnasium.Env):
         terminated, truncated = bool(last.terminated[0]), bool(last.truncated[0])
         if terminated or truncated:
             info["outcome"] = OUTCOMES[last.outcome[0]]
-        observation = {"view": last.robot_view[0], "configuration": last.configuration[0]}
+        observation = {"view": last.robot_view[0].copy(), "configuration": last.configuration[0]}
         if self.render_mode == "human":
             self.render()
         return observation, float(last.reward[0]), terminated, truncated, info

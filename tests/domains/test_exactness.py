@@ -48,6 +48,21 @@ def test_changed_rules_equal_the_reference(changes):
     compare_play(env, Reference(None, **rules), "adversarial", STEPS // 2, seed=4)
 
 
+def test_goals_within_reach_of_the_robot_equal_the_reference():
+    """Maps of our own, so that the robot can enter the goal, also in the step in which the person arrives."""
+    maps = []
+    for goal in ((3, 1), (1, 3), (4, 1), (3, 3), (5, 2), (2, 4)):
+        grid = np.zeros((7, 7), np.uint8)
+        grid[[0, -1], :] = grid[:, [0, -1]] = 1
+        grid[goal] = 2
+        grid[4, 4] = 1
+        maps.append(grid)
+    env = gymnasium.make("nesy/PersonFollowing-v0", size=7, maps=np.array(maps))
+    outcomes = compare_play(env, Reference(None), "adversarial", STEPS, seed=2)
+    assert outcomes["agent_at_goal"] > 20
+    assert outcomes["success"] > 20
+
+
 @pytest.mark.parametrize("variant", ["clean", "occluded", "intent", "false_belief"])
 @pytest.mark.parametrize("knows", ["map", "seen"])
 def test_variants_equal_the_reference(variant, knows):
