@@ -116,7 +116,7 @@ def compare(
     total = sum(_episodes(config, cell) for cell in missing)
     with progress.task("compare", total) as task:
         jobs_of = [(cell, run.path, config, seed, domain_name) for cell in missing]
-        run_cells(jobs_of, jobs, config, task)
+        run_cells(jobs_of, jobs, task)
     tables = [pq.read_table(_path(run, cell)) for cell in cells]
     with atomic_path(run.results / "episodes.parquet") as temporary:
         pq.write_table(pa.concat_tables(tables).replace_schema_metadata(None), temporary, compression="zstd")

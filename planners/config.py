@@ -68,8 +68,6 @@ class DQNConfig:
     """As the published code: bootstrap from terminal transitions as if the episode went on."""
     published_target_start: bool = False
     """As the published code: the target network starts from other weights than the network."""
-    published_sampling: bool = False
-    """As the published code: beliefs are sampled codes (Gumbel noise) rather than probabilities."""
 
     @classmethod
     def paper(cls, episodes: int = 10_000) -> DQNConfig:
@@ -122,7 +120,7 @@ class SearchConfig:
     """Person-following episodes, besides the run's experience, that the planner's tables are learned from."""
     practice_mixture: float = 0.3
     """Probability that the switching behaviour of these episodes acts at random."""
-    pomdp_py_simulations: int = 60
+    pomdp_py_simulations: int = 150
     """Simulations per decision of pomdp-py's POUCT, which is far slower per simulation."""
 
 
@@ -146,10 +144,6 @@ class CompareConfig:
     """Evaluation episodes per seed for the agents that search (`pomdp` and `search`)."""
     confidence: float = 0.95
     """Coverage of the intervals."""
-    engine: Literal["local", "ray"] = "local"
-    """Where the cells run: processes on this machine, or a Ray cluster."""
-    address: str = ""
-    """Address of the Ray cluster (engine ray); empty starts one here."""
     dqn: DQNConfig = field(default_factory=DQNConfig.fast)
     """How the DQN learns."""
     search: SearchConfig = field(default_factory=SearchConfig)

@@ -46,8 +46,8 @@ class _Relay:
         self._advance(steps)
 
 
-def run_cells(jobs_of: list[CellJob], jobs: int, config: CompareConfig, task: Task) -> None:
-    """Run every cell with the engine that `config` names."""
+def run_cells(jobs_of: list[CellJob], jobs: int, task: Task) -> None:
+    """Run every cell, in this process or in `jobs` of them."""
     if not jobs_of:
         return
     if jobs == 1 or len(jobs_of) == 1:
