@@ -30,9 +30,7 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--variants", nargs="+", choices=sorted(INSTANCES), default=list(INSTANCES))
-    parser.add_argument(
-        "--discount", type=float, default=None, help="left out: 0.9 for paper, 0.99 for others"
-    )
+    parser.add_argument("--discount", type=float, default=None, help="left out: 0.9 for paper, 0.99 for others")
     parser.add_argument("--bayes-seconds", type=float, default=60.0, help="time limit of each Bayes search")
     parser.add_argument("--json", type=Path, default=None, help="also write the rows to this file")
     arguments = parser.parse_args()
