@@ -45,14 +45,14 @@ PRESETS: dict[str, RunConfig] = {
     # Every step once, in under a minute: for CI and for trying things out. Its agents are weak.
     "smoke": RunConfig(
         preset="smoke",
-        collect=CollectConfig(crossing_episodes=200, following_episodes=200, shard_episodes=100),
-        train=TrainConfig(epochs=4, time_limit=0.0),
+        collect=CollectConfig(crossing_episodes=100, following_episodes=100, shard_episodes=50),
+        train=TrainConfig(epochs=2, time_limit=0.0),
         compare=CompareConfig(
             episodes=42,
-            planner_episodes=4,
+            planner_episodes=2,
             agents=("dqn", "pomdp", "greedy-follower", "random", "optimum"),
-            dqn=DQNConfig.fast(episodes=200),
-            search=SearchConfig(simulations=50, pomdp_py_simulations=10),
+            dqn=DQNConfig.fast(episodes=100),
+            search=SearchConfig(simulations=50, pomdp_py_simulations=10, practice_episodes=300),
         ),
     ),
     # The demo: everything for real within six minutes on two cores.

@@ -6,8 +6,8 @@ Sums run over the support of the factors now, so certain beliefs cost next to no
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from nesy.compiled import njit
 from nesy.dbn.elimination import Programs, plan_updates
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
