@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from domains.core import UNSEEN
 from domains.person_following.random_numbers import STREAM_WIDTH
 from domains.person_following.store import longest_plan
 from domains.person_following.variants import MAX_GOALS, Parameters
@@ -103,7 +104,8 @@ def allocate_results(num_envs: int, view_size: int) -> Results:
         ended=np.empty(num_envs, np.bool_),
         final_view=np.empty((num_envs, view_size, view_size), np.uint8),
         final_configuration=np.empty(num_envs, np.int64),
-        final_person_view=np.empty((num_envs, view_size, view_size), np.uint8),
-        final_pose=np.empty((num_envs, 3), np.int16),
-        final_counters=np.empty((num_envs, 2), np.int16),
+        # the crossing task has no person and leaves these three as they are
+        final_person_view=np.full((num_envs, view_size, view_size), UNSEEN, np.uint8),
+        final_pose=np.zeros((num_envs, 3), np.int16),
+        final_counters=np.zeros((num_envs, 2), np.int16),
     )
