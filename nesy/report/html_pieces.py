@@ -1,0 +1,36 @@
+"""Pieces of HTML that the sections of the report are made of."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from nesy.report.text import flat, number
+
+
+def table(columns: Sequence[str], rows: Iterable[Sequence[str]], caption: str, text_columns: int = 1) -> str:
+    """A table; its first `text_columns` columns are text, the others numbers. Everything in it is escaped."""
+
+    def cells(tag: str, values: Sequence[str]) -> str:
+        kinds = ["" if position < text_columns else ' class="number"' for position in range(len(values))]
+        return "".join(f"<{tag}{kind}>{html.escape(value)}</{tag}>" for kind, value in zip(kinds, values, strict=True))
+
+    body = "\n".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
+    return (
+        f'<div class="scroll"><table><caption>{html.escape(caption)}</caption>'
+        f"<thead><tr>{cells('th', columns)}</tr></thead><tbody>\n{body}\n</tbody></table></div>"
+    )
+
+
+def figure(svg: str, caption: str, label: str) -> str:
+    """A picture from inline SVG, with its caption and a label for screen readers."""
+    return (
+        f'<figure><div class="plot" role="img" aria-label="{html.escape(label)}">{svg}</div>'
+        f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+    )
+
+
+def figures_table(values: dict[str, Any], caption: str) -> str:
+    """Nested figures of summary.json, one row each."""
+    return table(("figure", "value"), [(name, number(value)) for name, value in flat(values)], caption)
