@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import clingo
 import numpy as np
@@ -80,19 +80,22 @@ class Shield:
             raise UserError(f"the fallback 'stay' needs an action '{stay}'; the actions are {', '.join(action_names)}")
         self.fallback, self._stay = fallback, stay
         self.view_size = view_size
-        sources = read_sources(list(rules))
-        labelled = [Source(source.name, _labelled(source)) for source in sources]
-        words = " ".join(source.text for source in sources)
+        self._sources = read_sources(list(rules))
+        self._size = (num_factors, num_values)
+        words = " ".join(source.text for source in self._sources)
         # only what some rule mentions can matter
         self.predicates = tuple(name for name in predicates if asp_name(name) in words)
         self._uses_code = "at(" in words.replace(" ", "")
-        situation = self._situation_program(num_factors, num_values)
-        encoding = Source("shield.lp", (ENCODINGS / "shield.lp").read_text(encoding="utf-8"))
-        solve([*sources, encoding], situation, (), time_limit=time_limit, memory_mb=memory_mb)
+        labelled = [_labelled(source) for source in self._sources]
+        programs = [*self._sources, _encoding()]
+        solve(programs, self._situation_program(), (), time_limit=time_limit, memory_mb=memory_mb)
+        self._ground(labelled)
+
+    def _ground(self, labelled: Sequence[str]) -> None:
+        """Ground the rules in this process: they are known to be harmless by now."""
         self._control = clingo.Control(["--warn=none", "--models=1"])
-        for source in (*labelled, encoding):
-            self._control.add("base", [], source.text)
-        self._control.add("base", [], situation)
+        for text in (*labelled, _encoding().text, self._situation_program()):
+            self._control.add("base", [], text)
         self._control.ground([("base", [])])
         self._inputs = [
             (atom.literal, atom.symbol)
@@ -102,8 +105,17 @@ class Shield:
         ]
         self._memory: dict[tuple[object, ...], Advice] = {}
 
-    def _situation_program(self, num_factors: int, num_values: int) -> str:
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but what was grounded: another process grounds the rules anew."""
+        return {name: value for name, value in vars(self).items() if name not in ("_control", "_inputs", "_memory")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._ground([_labelled(source) for source in self._sources])
+
+    def _situation_program(self) -> str:
         size = self.view_size
+        num_factors, num_values = self._size
         lines = [f"viewer({size // 2},{size - 1}).", "#external unseen."]
         lines.append(f"#external person(X,Y,H) : X = 0..{size - 1}, Y = 0..{size - 1}, H = 0..3.")
         lines += [f"#external now({asp_name(name)})." for name in self.predicates]
@@ -223,6 +235,10 @@ class Shield:
             allowed = tuple(self.fallback == "all" or name == self._stay for name in self.action_names)
         preferred = tuple(action in said["preferred"] for action in self._actions)
         return Advice(allowed, preferred, because, conflict)
+
+
+def _encoding() -> Source:
+    return Source("shield.lp", (ENCODINGS / "shield.lp").read_text(encoding="utf-8"))
 
 
 def _labelled(source: Source) -> str:
