@@ -101,7 +101,8 @@ class ShieldMask:
             rows = np.array(list(new.values()))
             for key, code, truth in zip(new, codes[rows], self._truth(codes[rows]), strict=True):
                 self._allowed[key] = self._mask_of(self.shield.advise(code, truth, key[1]))
-        return np.array([self._allowed[key] for key in keys], dtype=bool).reshape(len(codes), len(self.shield.action_names))
+        masks = [self._allowed[key] for key in keys]
+        return np.array(masks, dtype=bool).reshape(len(codes), len(self.shield.action_names))
 
     def advise(self, code: np.ndarray, configuration: int) -> Advice:
         """What the rules say in one situation, with the rules behind it; the code is uint8 [N].
