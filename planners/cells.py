@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from domains.core import Domain
-from nesy.progress import Progress
+from nesy.progress import SILENT, Progress
 from nesy.run_folder import RunFolder
 from planners import config as settings
 from planners.agents import Agent, DQNAgent, PlanningAgent
@@ -31,7 +31,7 @@ def build_agent(
     advance: Callable[[int], None],
 ) -> tuple[Agent, Perception | None, Columns | None]:
     """The cell's agent, its perception (if it needs one), and its training episodes (if it learns)."""
-    own_seed = int(np.random.SeedSequence([seed, cell.seed, *cell.name.encode()]).generate_state(1)[0])
+    own_seed = cell_seed(cell, seed)
     if cell.agent in settings.REFERENCE_AGENTS:
         return _reference(cell, domain, own_seed), None, None
     from nesy.world_model import SymbolicCodec, load_world_model
@@ -52,6 +52,30 @@ def build_agent(
     )
     policy.save(run.policies / f"{cell.name}.safetensors")
     return DQNAgent(policy), perception, training
+
+
+def restored_agent(
+    cell: Cell, run: RunFolder, domain: Domain, config: CompareConfig, seed: int
+) -> tuple[Agent, Perception | None]:
+    """The agent of a finished cell as it was when it was evaluated: a learner with its stored policy.
+
+    Raises:
+        UserError: the policy is missing or damaged.
+    """
+    if cell.agent not in settings.LEARNING_AGENTS:
+        agent, perception, _ = build_agent(cell, run, domain, config, seed, SILENT, lambda count: None)
+        return agent, perception
+    from nesy.world_model import SymbolicCodec, load_world_model
+    from planners.dqn import DQNPolicy
+
+    codec = SymbolicCodec(load_world_model(run.world_model))
+    perception = Perception(codec, cell.influence, np.random.default_rng([cell_seed(cell, seed), 1]))
+    return DQNAgent(DQNPolicy.load(run.policies / f"{cell.name}.safetensors")), perception
+
+
+def cell_seed(cell: Cell, seed: int) -> int:
+    """Seed of everything random in a cell but learning, from that of the run."""
+    return int(np.random.SeedSequence([seed, cell.seed, *cell.name.encode()]).generate_state(1)[0])
 
 
 def _reference(cell: Cell, domain: Domain, seed: int) -> Agent:
