@@ -94,17 +94,7 @@ class Experience:
         Raises:
             UserError: no folder, no parts, a damaged part, or an unknown source.
         """
-        folder = Path(folder)
-        wanted = None if sources is None else set(sources)
-        if wanted is not None and not wanted <= set(SOURCES):
-            raise UserError(f"unknown experience source {sorted(wanted - set(SOURCES))}; known: {', '.join(SOURCES)}")
-        parts = sorted(folder.glob("part-*.parquet"))
-        if not parts:
-            raise UserError(f"{folder}: no experience here (no part-*.parquet); make it with: nesy collect")
-        loaded = [columns for part in parts if (columns := _read_part(part, wanted)) is not None]
-        if not loaded:
-            raise UserError(f"{folder}: no transitions of the sources {sorted(wanted or ())}")
-        return cls(**{name: np.concatenate([columns[name] for columns in loaded]) for name in loaded[0]})
+        return cls(**load_columns(folder, COLUMNS, sources))
 
     def select(self, mask: np.ndarray) -> Experience:
         """The rows that `mask` (bool `[n]` or an index array) picks, in that order."""
@@ -137,6 +127,32 @@ class Experience:
 
 
 COLUMNS = tuple(field.name for field in fields(Experience))
+
+
+def load_columns(
+    folder: Path | str, names: Sequence[str], sources: Iterable[str] | None = None
+) -> dict[str, np.ndarray]:
+    """Some columns of every part of `folder`, in the order of the file names: a fraction of the time of all.
+
+    Args:
+        folder: where the parts lie.
+        names: names of `COLUMNS`.
+        sources: only rows of these sources; None for all.
+
+    Raises:
+        UserError: as `Experience.load`.
+    """
+    folder = Path(folder)
+    wanted = None if sources is None else set(sources)
+    if wanted is not None and not wanted <= set(SOURCES):
+        raise UserError(f"unknown experience source {sorted(wanted - set(SOURCES))}; known: {', '.join(SOURCES)}")
+    parts = sorted(folder.glob("part-*.parquet"))
+    if not parts:
+        raise UserError(f"{folder}: no experience here (no part-*.parquet); make it with: nesy collect")
+    loaded = [columns for part in parts if (columns := _read_part(part, wanted, names)) is not None]
+    if not loaded:
+        raise UserError(f"{folder}: no transitions of the sources {sorted(wanted or ())}")
+    return {name: np.concatenate([columns[name] for columns in loaded]) for name in names}
 
 
 def schema(cells: int) -> pa.Schema:
@@ -190,27 +206,35 @@ def count_rows(path: Path) -> int | None:
     return int(metadata.num_rows) if names == set(COLUMNS) else None
 
 
-def _read_part(path: Path, sources: set[str] | None) -> dict[str, np.ndarray] | None:
+def _read_part(path: Path, sources: set[str] | None, names: Sequence[str]) -> dict[str, np.ndarray] | None:
     try:
         # Read from an open file: a path would be taken for a data set and its folder names for columns.
         with path.open("rb") as stream:
-            table = pq.read_table(stream)
-    except (OSError, pa.ArrowException) as error:
+            file = pq.ParquetFile(stream)
+            found = file.schema_arrow
+            missing = [name for name in COLUMNS if name not in found.names]
+            table = (
+                None
+                if missing
+                else file.read(columns=list(names) + ["source"] * (sources is not None and "source" not in names))
+            )
+    except (OSError, ValueError, pa.ArrowException) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise UserError(f"{path}: damaged, cannot be read as Parquet ({reason}); delete it, collect again") from None
-    missing = [name for name in COLUMNS if name not in table.column_names]
-    if missing:
+    if table is None:
         raise UserError(f"{path}: not a part of experience, columns missing: {', '.join(missing)}")
-    cells = getattr(table.schema.field("view").type, "list_size", 0)
+    cells = getattr(found.field("view").type, "list_size", 0)
     side = round(cells**0.5)
-    if side * side != cells or not cells or not table.select(list(COLUMNS)).schema.equals(schema(cells)):
+    if side * side != cells or not cells or not _same_types(found, schema(cells)):
         raise UserError(f"{path}: not a part of experience, its columns have other types than expected")
-    source = np.asarray(table["source"].cast(pa.string()).to_numpy(zero_copy_only=False), dtype=str)
+    source = np.zeros(0, dtype=str)
+    if "source" in table.column_names:
+        source = np.asarray(table["source"].cast(pa.string()).to_numpy(zero_copy_only=False), dtype=str)
     keep = None if sources is None else np.isin(source, sorted(sources))
     if keep is not None and not keep.any():
         return None
     columns: dict[str, np.ndarray] = {}
-    for name in COLUMNS:
+    for name in names:
         if name == "source":
             values = source.astype("U20")
         elif name in _VIEWS or name in _POSES:
@@ -218,7 +242,11 @@ def _read_part(path: Path, sources: set[str] | None) -> dict[str, np.ndarray] | 
             values = values.reshape(-1, side, side) if name in _VIEWS else values.reshape(-1, 3)
         else:
             values = table[name].to_numpy()
-        if len(values) != len(source):
+        if len(values) != table.num_rows:
             raise UserError(f"{path}: damaged, column {name} has missing values")
         columns[name] = values if keep is None else values[keep]
     return columns
+
+
+def _same_types(found: pa.Schema, wanted: pa.Schema) -> bool:
+    return all(found.field(field.name).equals(field) for field in wanted)
