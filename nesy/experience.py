@@ -213,11 +213,8 @@ def _read_part(path: Path, sources: set[str] | None, names: Sequence[str]) -> di
             file = pq.ParquetFile(stream)
             found = file.schema_arrow
             missing = [name for name in COLUMNS if name not in found.names]
-            table = (
-                None
-                if missing
-                else file.read(columns=list(names) + ["source"] * (sources is not None and "source" not in names))
-            )
+            wanted = list(dict.fromkeys([*names, *(() if sources is None else ("source",))]))
+            table = None if missing else file.read(columns=wanted)
     except (OSError, ValueError, pa.ArrowException) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise UserError(f"{path}: damaged, cannot be read as Parquet ({reason}); delete it, collect again") from None
@@ -229,14 +226,15 @@ def _read_part(path: Path, sources: set[str] | None, names: Sequence[str]) -> di
         raise UserError(f"{path}: not a part of experience, its columns have other types than expected")
     source = np.zeros(0, dtype=str)
     if "source" in table.column_names:
-        source = np.asarray(table["source"].cast(pa.string()).to_numpy(zero_copy_only=False), dtype=str)
+        indexed = table["source"].unify_dictionaries().combine_chunks()
+        source = np.asarray(indexed.dictionary.to_pylist(), dtype="U20")[indexed.indices.to_numpy()]
     keep = None if sources is None else np.isin(source, sorted(sources))
     if keep is not None and not keep.any():
         return None
     columns: dict[str, np.ndarray] = {}
     for name in names:
         if name == "source":
-            values = source.astype("U20")
+            values = source
         elif name in _VIEWS or name in _POSES:
             values = table[name].combine_chunks().flatten().to_numpy(zero_copy_only=False)
             values = values.reshape(-1, side, side) if name in _VIEWS else values.reshape(-1, 3)
