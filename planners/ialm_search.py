@@ -88,6 +88,23 @@ class IALMSearch:
             "max_depth": int(depths[1]),
         }
 
+    def observation_name(self, observation: int) -> str:
+        """What a branch of the tree stands for, in words (see `_simulate`)."""
+        moved = self.model.dbn.action_names[observation % 4]
+        if observation < 4:
+            return f"after {moved}: not in view"
+        pose = observation // 4 - 1
+        window = self.model.motion.window
+        side, ahead = pose // 4 // 512 - window, pose // 4 % 512 - window
+        return f"after {moved}: {place_name(side, ahead)}"
+
+
+def place_name(side: int, ahead: int) -> str:
+    """A relative place in words."""
+    across = f"{abs(side)} {'right' if side > 0 else 'left'}" if side else ""
+    along = f"{abs(ahead)} {'ahead' if ahead > 0 else 'behind'}" if ahead else ""
+    return ", ".join(filter(None, (across, along))) or "same place"
+
 
 @njit(cache=True)
 def _simulate(

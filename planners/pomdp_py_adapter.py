@@ -218,6 +218,8 @@ class POUCTAgent:
     def __init__(self, model: IALM, compiled: kernels.Model, config: SearchConfig, rng: np.random.Generator) -> None:
         self.model, self.compiled, self.rng = model, compiled, rng
         self.planner = LeafValuePOUCT(model, config)
+        self.root: Any = None
+        """Root of the last search's tree, for pictures."""
 
     def plan(self, belief: np.ndarray) -> tuple[int, dict[str, Any]]:
         """Choose an action.
@@ -230,6 +232,7 @@ class POUCTAgent:
         """
         agent = RobotAgent(self.model, self.compiled, belief, self.rng)
         action = self.planner.plan(agent)
+        self.root = agent.tree
         children = agent.tree.children
         order = sorted(children, key=lambda a: a.index)
         return action.index, {

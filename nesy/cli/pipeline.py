@@ -265,13 +265,21 @@ class Pipeline:
         )
         self.run.update_summary(comparison=cells)
         write_json(self.run.results / "comparison.json", cells)
+        self._timed("replays", self._record_replays)
         return {"comparison": cells}
+
+    def _record_replays(self) -> None:
+        """Play a few episodes of the comparison again for the report, unless that has been done."""
+        from planners.replay import record_replays
+
+        record_replays(self.run, self.config.compare, self.config.seed, self.progress, self.config.domain)
 
     def report(self) -> dict[str, Any]:
         """Write report.html."""
         from nesy.report.page import write_report
 
         self.run.require("collect", "train", "extract", "compare")
+        self._timed("replays", self._record_replays)  # a run compared by an earlier version has none
         path = self._timed("report", lambda: write_report(self.run, self.progress))
         return {"report": str(path)}
 
