@@ -5,14 +5,15 @@ Every field's docstring is its help text on the command line.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 INFLUENCE_MODES = ("zero", "random", "egocentric", "perspective-shift", "perfect-information")
 INPUT_SETS = ("paper", "full")
 LEARNING_AGENTS = ("dqn",)
 PLANNING_AGENTS = ("pomdp", "search")
-REFERENCE_AGENTS = ("greedy-follower", "greedy-last-seen", "random", "optimum")
+ORACLES = ("optimum", "bayes-optimum", "egocentric-optimum")
+REFERENCE_AGENTS = ("greedy-follower", "greedy-last-seen", "random", *ORACLES)
 AGENTS = LEARNING_AGENTS + PLANNING_AGENTS + REFERENCE_AGENTS
 
 
@@ -64,10 +65,22 @@ class DQNConfig:
     """Whether replay prefers transitions with a large error."""
     bootstrap: Literal["timeout", "truncated"] = "timeout"
     """Which endings are only the clock's, so that the value of what would have followed counts."""
+    target_period: int = 0
+    """Updates between copies of the network into the target network; 0: it moves a little with every update (tau)."""
+    fallback: Literal["mode", "uniform"] = "mode"
+    """What b~ is while the person is out of view: what the influence mode has, or uniform in every mode."""
+    checkpoint_seconds: float = 30.0
+    """Seconds between the checkpoints that a stopped training goes on from; the results do not depend on it."""
     published_terminals: bool = False
     """As the published code: bootstrap from terminal transitions as if the episode went on."""
     published_target_start: bool = False
     """As the published code: the target network starts from other weights than the network."""
+    published_fallbacks: bool = False
+    """As the published code: where nothing can be imagined, zeros (perspective-shift) or the last b~ (others)."""
+    published_sampling: bool = False
+    """As the published code: b and b~ are not distributions but relaxed samples of them (temperature 0.6)."""
+    published_occlusion: bool = False
+    """As the published code: perfect information has the person unable to look through walls."""
 
     @classmethod
     def paper(cls, episodes: int = 10_000) -> DQNConfig:
@@ -92,6 +105,18 @@ class DQNConfig:
             tau=0.005,
             gradient_clip=10.0,
             reward_scale=1.0,
+        )
+
+    @classmethod
+    def published(cls, episodes: int = 10_000) -> DQNConfig:
+        """The settings of the paper with everything in which the published code differs from the text."""
+        return replace(
+            cls.paper(episodes),
+            published_terminals=True,
+            published_target_start=True,
+            published_fallbacks=True,
+            published_sampling=True,
+            published_occlusion=True,
         )
 
     @classmethod
@@ -128,8 +153,9 @@ class SearchConfig:
 class CompareConfig:
     """What is compared: the grid of agents x input sets x influence modes x variants x seeds."""
 
-    agents: tuple[str, ...] = AGENTS
-    """Which agents: dqn, pomdp (pomdp-py), search, greedy-follower, greedy-last-seen, random, optimum."""
+    agents: tuple[str, ...] = AGENTS[:-2]
+    """Which agents: dqn, pomdp (pomdp-py), search, greedy-follower, greedy-last-seen, random, and the exact oracles
+    optimum (full state), bayes-optimum and egocentric-optimum (where the task is small enough)."""
     inputs: tuple[str, ...] = ("full",)
     """Input sets of the DQN: paper (b, b~) or full (b, b~ and the configuration)."""
     influences: tuple[str, ...] = ("random", "perspective-shift", "perfect-information")
@@ -144,6 +170,10 @@ class CompareConfig:
     """Evaluation episodes per seed for the agents that search (`pomdp` and `search`)."""
     confidence: float = 0.95
     """Coverage of the intervals."""
+    rules: tuple[str, ...] = ()
+    """Rule files (docs/asp.md) that no agent may break, neither while it learns nor when it acts."""
+    policies: tuple[str, ...] = ()
+    """Trained policies (.safetensors files) to compare besides, as they are."""
     dqn: DQNConfig = field(default_factory=DQNConfig.fast)
     """How the DQN learns."""
     search: SearchConfig = field(default_factory=SearchConfig)
