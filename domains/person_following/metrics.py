@@ -1,7 +1,6 @@
-"""Metrics of social navigation, by episode, computed from what a batched environment reports of each step.
+"""Metrics of social navigation, one value per episode, from the steps that a runner recorded.
 
-What each metric means, its unit and its source: docs/metrics.md. `EpisodeMetrics` is fed one batched step at a
-time and returns a row for every episode that ended in it; the belief metrics are functions of their own.
+What each metric means, its unit and its source: docs/metrics.md.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from domains.core import FORWARD, LEFT, OUTCOMES, RIGHT, STAY
+from domains.recording import RecordedSteps
 
 METRICS: dict[str, str] = {
     "return": "sum of rewards",
@@ -36,129 +36,114 @@ METRICS: dict[str, str] = {
     "time_lost": "share of steps in which the robot was beyond the follow distance",
     "recovery_time": "mean length of the spells beyond the follow distance that the robot ended; NaN if none",
 }
-"""Name and meaning of every column of a row, beside `episode` (counted per environment) and `environment`."""
+"""Name and meaning of every metric of an episode."""
 
-_OUTCOME_COLUMNS = OUTCOMES[1:]
+BELIEF_METRICS: dict[str, str] = {
+    "kl": "KL of the true code of the person's view to the belief held, summed over factors, in nats",
+    "factor_accuracy": "share of factors whose most likely value is true",
+    "exact_view": "1 where the most likely code decodes to the person's view in every cell",
+}
+"""Name and meaning of every metric of a belief about the person's view."""
+
+PERSONAL_SPACE = 2
+"""The person is intruded on where it is nearer than this many cells (Manhattan)."""
 
 
-class EpisodeMetrics:
-    """Gathers steps of B environments into one row of metrics per episode.
+def episode_metrics(
+    steps: RecordedSteps, follow_distance: int = 3, robot_rest: int = 0, personal_space: int = PERSONAL_SPACE
+) -> dict[str, NDArray[Any]]:
+    """Every metric of every finished episode.
 
-    Positions are followed relative to the robot, which every `BatchedEnvironment` reports, so that nothing
-    of a concrete domain is needed.
+    Args:
+        steps: T steps of B environments.
+        follow_distance: the greatest distance at which the robot still follows.
+        robot_rest: the robot was held at steps t that are a multiple of this; 0 for never.
+        personal_space: see `PERSONAL_SPACE`.
+
+    Returns:
+        Arrays [E], one entry per finished episode, ordered by environment and then in time: `environment`,
+        `episode` (0 for the first of its environment), every name of `METRICS` and every name of `steps.extra`
+        (means over the steps that have a value; NaN where none has).
     """
+    environment, episode, at = _finished(steps.outcome)
+    number = np.cumsum(np.r_[True, (np.diff(environment) != 0) | (np.diff(episode) != 0)])[: len(at)] - 1
+    first = np.nonzero(np.diff(number, prepend=-1))[0]
+    count = len(first)
 
-    def __init__(self, num_envs: int, follow_distance: int = 3, personal_space: int = 2) -> None:
-        """Begin to gather.
+    def of(values: NDArray[Any]) -> NDArray[Any]:
+        """The values of the finished episodes' steps, [S]."""
+        return np.moveaxis(values, 1, 0).reshape(-1, *values.shape[2:])[at]
 
-        Args:
-            num_envs: B.
-            follow_distance: the greatest distance at which the robot still follows.
-            personal_space: the person is intruded on where it is nearer than this many cells (Manhattan).
-        """
-        self.follow_distance, self.personal_space = follow_distance, personal_space
-        self._sums = {name: np.zeros(num_envs) for name in _SUMMED}
-        self._min_distance = np.full(num_envs, np.inf)
-        self._spell = np.zeros(num_envs)
-        self._episode = np.zeros(num_envs, np.int64)
-        self._pose = np.tile(np.array([0, 0, 0]), (num_envs, 1))
+    def total(values: NDArray[Any]) -> NDArray[np.float64]:
+        """Sums by episode [E]."""
+        return np.asarray(np.bincount(number, np.asarray(values, np.float64), count), np.float64)
 
-    def begin(self, relative_poses: NDArray[np.integer], which: NDArray[np.bool_] | None = None) -> None:
-        """Note the relative poses [B, 3] with which episodes begin; before the first step, for all."""
-        chosen = np.ones(len(relative_poses), np.bool_) if which is None else which
-        self._pose[chosen] = relative_poses[chosen]
-
-    def step(
-        self,
-        actions: NDArray[np.integer],
-        rewards: NDArray[np.floating],
-        infos: dict[str, Any],
-        relative_poses: NDArray[np.integer],
-    ) -> list[dict[str, float]]:
-        """Add one step of all environments; rows of the episodes that ended in it.
-
-        Args:
-            actions: what the robots chose [B].
-            rewards: what they got [B].
-            infos: as returned by the environment's `step`.
-            relative_poses: of the environment after the step (of the new episode where one began).
-        """
-        pose = np.asarray(infos["final_relative_pose"], dtype=np.int64)
-        person = np.asarray(infos["person_action"])
-        turned = (actions == LEFT) | (actions == RIGHT)
-        moved = _robot_moved(self._pose, pose, actions, person)
-        gap = np.abs(pose[:, :2]).sum(axis=1)
-        far = np.asarray(infos["distance"]) > self.follow_distance
-        blocked_by_person = (actions == FORWARD) & ~moved & (self._pose[:, 0] == 0) & (self._pose[:, 1] == 1)
-        sums = self._sums
-        sums["return"] += rewards
-        sums["steps"] += 1
-        sums["path_length"] += moved
-        sums["heading_changes"] += turned
-        sums["time_not_moving"] += ~moved & ~turned
-        sums["robot_collisions"] += blocked_by_person
-        sums["person_collisions"] += (gap == 0) & (person == FORWARD)
-        sums["mean_distance"] += gap
-        sums["intrusion"] += gap < self.personal_space
-        sums["person_delay"] += np.asarray(infos["person_waited"])
-        sums["person_steps"] += (person != STAY) & (person >= 0)
-        sums["visibility"] += np.asarray(infos["visible"])
-        sums["time_lost"] += far
-        back = ~far & (self._spell > 0)
-        sums["recoveries"] += back
-        sums["recovery_time"] += np.where(back, self._spell, 0)
-        self._spell = np.where(far, self._spell + 1, 0)
-        self._min_distance = np.minimum(self._min_distance, gap)
-        ended = np.asarray(infos["_final_obs"])
-        rows = [self._row(int(b), str(infos["outcome"][b])) for b in np.nonzero(ended)[0]]
-        self._pose = pose
-        if ended.any():
-            for values in sums.values():
-                values[ended] = 0
-            self._min_distance[ended] = np.inf
-            self._spell[ended] = 0
-            self._episode[ended] += 1
-            self.begin(relative_poses, ended)
-        return rows
-
-    def _row(self, b: int, outcome: str) -> dict[str, float]:
-        sums = {name: float(values[b]) for name, values in self._sums.items()}
-        steps = sums["steps"]
-        row: dict[str, float] = {"environment": b, "episode": int(self._episode[b])}
-        row["return"], row["steps"] = sums["return"], steps
-        for name in _OUTCOME_COLUMNS:
-            row[name] = float(outcome == name)
-        # Nobody can arrive together before the person has made its moves: those are the shortest time there is.
-        shortest = max(sums["person_steps"], 1.0)
-        row["spl"] = row["success"] * shortest / max(shortest, steps)
-        for name in ("path_length", "heading_changes", "robot_collisions", "person_collisions", "person_delay"):
-            row[name] = sums[name]
-        for name in ("time_not_moving", "mean_distance", "intrusion", "visibility", "time_lost"):
-            row[name] = sums[name] / steps
-        row["min_distance"] = float(self._min_distance[b])
-        row["psc"] = 1.0 - row["intrusion"]
-        recoveries = sums["recoveries"]
-        row["recovery_time"] = sums["recovery_time"] / recoveries if recoveries else float("nan")
-        return {name: row[name] for name in ("environment", "episode", *METRICS)}
+    length = np.bincount(number, minlength=count)
+    time = np.arange(len(at)) - first[number] + 1
+    person = of(steps.person_action)
+    before, after = of(steps.pose_before).astype(np.int64), of(steps.pose_after).astype(np.int64)
+    held = (time % robot_rest == 0) if robot_rest else np.zeros(len(at), np.bool_)
+    action = np.where(held, STAY, of(steps.action))
+    moved = _robot_moved(before, after, action, person)
+    turned = (action == LEFT) | (action == RIGHT)
+    gap = np.abs(after[:, :2]).sum(axis=1)
+    far = of(steps.distance) > follow_distance
+    # Nobody can arrive together before the person has made its moves: those are the shortest time there is.
+    shortest = np.maximum(total((person != STAY) & (person >= 0)), 1.0)
+    ends = np.append(first[1:], len(at)) - 1 if count else first
+    outcome = of(steps.outcome)[ends]
+    columns: dict[str, NDArray[Any]] = {"environment": environment[first], "episode": episode[first]}
+    columns["return"], columns["steps"] = total(of(steps.reward)), length
+    for code, name in enumerate(OUTCOMES[1:], start=1):
+        columns[name] = (outcome == code).astype(np.float64)
+    columns["spl"] = columns["success"] * shortest / np.maximum(shortest, length)
+    columns["path_length"] = total(moved)
+    columns["heading_changes"] = total(turned)
+    columns["time_not_moving"] = total(~moved & ~turned) / length
+    columns["robot_collisions"] = total((action == FORWARD) & ~moved & (before[:, 0] == 0) & (before[:, 1] == 1))
+    columns["person_collisions"] = total((gap == 0) & (person == FORWARD))
+    columns["mean_distance"] = total(gap) / length
+    columns["min_distance"] = np.minimum.reduceat(gap, first).astype(np.float64) if count else np.zeros(0)
+    columns["intrusion"] = total(gap < personal_space) / length
+    columns["psc"] = 1.0 - columns["intrusion"]
+    columns["person_delay"] = total(person == STAY)
+    columns["visibility"] = total(of(steps.visible)) / length
+    columns["time_lost"] = total(far) / length
+    columns["recovery_time"] = _recovery_time(far, number, first, count)
+    columns = {name: columns[name] for name in ("environment", "episode", *METRICS)}
+    for name, values in steps.extra.items():
+        some = of(values)
+        there = ~np.isnan(some)
+        known = total(there)
+        columns[name] = np.where(known > 0, total(np.where(there, some, 0.0)) / np.maximum(known, 1), np.nan)
+    return columns
 
 
-_SUMMED = (
-    "return",
-    "steps",
-    "path_length",
-    "heading_changes",
-    "time_not_moving",
-    "robot_collisions",
-    "person_collisions",
-    "mean_distance",
-    "intrusion",
-    "person_delay",
-    "person_steps",
-    "visibility",
-    "time_lost",
-    "recoveries",
-    "recovery_time",
-)
+def _finished(
+    outcome: NDArray[np.integer[Any]],
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Environment, episode and place in the flattened [B, T] of every step [S] of a finished episode."""
+    ended = (outcome.T != 0).astype(np.int64)
+    before = np.cumsum(ended, axis=1) - ended
+    kept = before < ended.sum(axis=1, keepdims=True)
+    environment, _ = np.nonzero(kept)
+    return environment, before[kept], np.flatnonzero(kept)
+
+
+def _recovery_time(
+    far: NDArray[np.bool_], number: NDArray[np.int64], first: NDArray[np.int64], count: int
+) -> NDArray[np.float64]:
+    """Mean length [E] of the spells of `far` [S] that end within their episode; NaN where there is none."""
+    opens = far.copy()
+    opens[1:] &= ~far[:-1] | (number[1:] != number[:-1])
+    back = ~far
+    back[1:] &= far[:-1] & (number[1:] == number[:-1])
+    back[first] = False
+    spell = np.cumsum(opens)
+    lengths = np.bincount(spell[far], minlength=int(spell[-1]) + 1 if len(spell) else 1)
+    spells = np.bincount(number[back], minlength=count)
+    steps = np.bincount(number[back], lengths[spell[back]], count)
+    return np.where(spells > 0, steps / np.maximum(spells, 1), np.nan)
 
 
 def _robot_moved(
@@ -190,9 +175,7 @@ def belief_metrics(
         true_views: [B, v, v], the person's true views.
 
     Returns:
-        `kl`: KL of the true code (a one-hot belief) to the belief, summed over factors, in nats;
-        `factor_accuracy`: share of factors whose most likely value is true; `exact_view` (with views):
-        1 where every cell agrees.
+        Arrays [B] named as in `BELIEF_METRICS`; `exact_view` only where both views are given.
     """
     picked = np.take_along_axis(beliefs, true_codes[..., None].astype(np.int64), axis=-1)[..., 0]
     result = {
@@ -204,4 +187,4 @@ def belief_metrics(
     return result
 
 
-__all__ = ["METRICS", "EpisodeMetrics", "belief_metrics"]
+__all__ = ["BELIEF_METRICS", "METRICS", "PERSONAL_SPACE", "belief_metrics", "episode_metrics"]
