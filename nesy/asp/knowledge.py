@@ -127,7 +127,8 @@ class KnowledgeBase:
         Raises:
             UserError: no such predicate.
         """
-        from nesy.asp.semantics import asp_rules, predicate_rules, readable
+        from nesy.asp.rules import asp_rules, readable
+        from nesy.asp.semantics import predicate_rules
 
         started = time.perf_counter()
         found = predicate_rules(self._book(), predicate, held_out, num_values=self.dbn.num_values)

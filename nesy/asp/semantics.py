@@ -1,63 +1,35 @@
-"""What values mean: short rules between factors and predicates, induced from the codebook and scored on held-out views.
+"""What codes mean: short rules between factors and predicates, induced from the codebook, in both directions.
 
-Both directions: a predicate from factor values (`wall_ahead` if X2 in {0, 3} and X5 in {4}) and a factor value from
-predicates. A decision tree finds candidate rules; values that a path leaves open become one set, and conditions that
-a rule does not need are dropped again.
+`predicate_rules`  wall_ahead  :- X2 in {0, 3}, X5 = 4         a predicate from factor values
+`value_rules`      X2 = 3      :- wall_ahead, not goal_visible  a factor's value from predicates
+
+Predicates are used in the order of the vocabulary, those with a name of their own before places and cells. How well
+rules do on views they were not learned from is measured in nesy.asp.semantic_scores.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from nesy.asp.induction import induce
+from nesy.asp.minimal import minimal_form
+from nesy.asp.rules import Rule, RuleSet, counted, scored
 from nesy.dbn.codebook import Codebook
 from nesy.errors import UserError
 
-
-@dataclass(frozen=True)
-class Rule:
-    """A conjunction: every condition allows a set of values."""
-
-    conditions: tuple[tuple[int, tuple[int, ...]], ...]
-    """(factor or predicate, allowed values), ascending; the values of a predicate are 0 and 1."""
-    right: int
-    """Views where the rule applies and is right."""
-    applies: int
-    """Views where the rule applies."""
-
-
-@dataclass(frozen=True)
-class RuleSet:
-    """A disjunction of rules for one predicate or one value, with its scores."""
-
-    target: str
-    """What is concluded."""
-    rules: tuple[Rule, ...]
-    """The most general rules first."""
-    precision: float
-    """On the held-out views: of those where a rule applies, where the target holds; 1 if none applies."""
-    recall: float
-    """On the held-out views: of those where the target holds, where a rule applies; 1 if it holds nowhere."""
-    accuracy: float
-    """On all views."""
-    held_out: int
-    """Number of held-out views."""
-
-    @property
-    def length(self) -> int:
-        """Conditions of all rules together."""
-        return sum(len(rule.conditions) for rule in self.rules)
-
-    def applies(self, values: np.ndarray) -> np.ndarray:
-        """Where some rule applies: bool [n] for values integers [n, C]."""
-        return _applies(self.rules, values)
+_PLACE = re.compile(r"_\d+_\d+$")
 
 
 def predicate_rules(
-    codebook: Codebook, predicate: str, held_out: float = 0.25, seed: int = 0, num_values: int | None = None
+    codebook: Codebook,
+    predicate: str,
+    held_out: float = 0.25,
+    seed: int = 0,
+    num_values: int | None = None,
+    test: np.ndarray | None = None,
 ) -> RuleSet:
     """Rules for a predicate from the values of factors.
 
@@ -67,12 +39,15 @@ def predicate_rules(
         held_out: share of the distinct views kept for scoring; 0 to learn from all and score on all.
         seed: of the split.
         num_values: K; by default the largest value met, plus one.
+        test: the views kept for scoring, in place of a random share.
 
     Raises:
         UserError: no such predicate, or no views.
     """
+    train, test = split(len(codebook), held_out, seed) if test is None else _without(len(codebook), test)
     k = num_values or int(codebook.codes.max(initial=0)) + 1
-    return _rules(predicate, codebook.codes.astype(np.int64), codebook.predicate(predicate), k, held_out, seed)
+    values, truth = codebook.codes.astype(np.int64), codebook.predicate(predicate)
+    return scored(predicate, induce(values[train], truth[train], k), values, truth, test)
 
 
 def value_rules(
@@ -82,180 +57,74 @@ def value_rules(
     predicates: Sequence[str] | None = None,
     held_out: float = 0.25,
     seed: int = 0,
+    test: np.ndarray | None = None,
 ) -> RuleSet:
     """Rules for `factor = value` from predicates (all of them by default).
+
+    Where there is a small exact form it is the shortest one; otherwise the rules come from a tree. The columns of
+    the rules are those of `ordered(predicates)`.
 
     Raises:
         UserError: no such predicate, or no views.
     """
-    names = codebook.predicate_names if predicates is None else tuple(predicates)
-    truth = np.stack([codebook.predicate(name) for name in names], axis=1).astype(np.int64)
-    target = codebook.codes[:, factor] == value
-    return _rules(f"{factor}={value}", truth, target, 2, held_out, seed)
+    train, test = split(len(codebook), held_out, seed) if test is None else _without(len(codebook), test)
+    names = ordered(codebook.predicate_names if predicates is None else predicates)
+    columns = np.stack([codebook.predicate(name) for name in names], axis=1)
+    truth = codebook.codes[:, factor] == value
+    rules = _value_rules(columns[train], truth[train])
+    return scored(f"{factor}={value}", rules, columns.astype(np.int64), truth, test)
 
 
-def _rules(target: str, values: np.ndarray, truth: np.ndarray, num_values: int, held_out: float, seed: int) -> RuleSet:
-    if not len(values):
+def _value_rules(columns: np.ndarray, truth: np.ndarray) -> tuple[Rule, ...]:
+    values = columns.astype(np.int64)
+    if truth.any() and not truth.all():
+        form = minimal_form(columns, truth)
+        if form is not None:
+            rules = [counted([(c, (int(holds),)) for c, holds in one], values, truth) for one in form]
+            return tuple(sorted(rules, key=lambda rule: -rule.right))
+    return induce(values, truth, 2)
+
+
+def ordered(predicates: Sequence[str]) -> tuple[str, ...]:
+    """Predicates in the order in which rules use them: names of their own, places, then cells."""
+
+    def rank(name: str) -> int:
+        return 0 if not _PLACE.search(name) else 2 if name.startswith("cell_") else 1
+
+    return tuple(sorted(predicates, key=rank))
+
+
+def split(views: int, held_out: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Views to learn from and views to score on: disjoint, or all and all if nothing is held out.
+
+    Raises:
+        UserError: there are no views.
+    """
+    if not views:
         raise UserError("there are no views to learn from")
-    order = np.random.default_rng(seed).permutation(len(values))
-    split = round(held_out * len(values))
-    test, train = (order[:split], order[split:]) if split else (order, order)
-    rules = _learn(values[train], truth[train], num_values)
-    said, wanted = _applies(rules, values[test]), truth[test]
-    right = int((said & wanted).sum())
-    everywhere = _applies(rules, values)
-    return RuleSet(
-        target=target,
-        rules=rules,
-        precision=right / int(said.sum()) if said.any() else 1.0,
-        recall=right / int(wanted.sum()) if wanted.any() else 1.0,
-        accuracy=float((everywhere == truth).mean()),
-        held_out=len(test),
-    )
+    order = np.random.default_rng(seed).permutation(views)
+    count = round(held_out * views)
+    return (order[count:], order[:count]) if count else (order, order)
 
 
-def _learn(values: np.ndarray, truth: np.ndarray, num_values: int) -> tuple[Rule, ...]:
-    if not truth.any():
-        return ()
-    if truth.all():
-        return (Rule((), len(truth), len(truth)),)
-    from sklearn.tree import DecisionTreeClassifier
-
-    columns = values.shape[1]
-    one_hot = (values[:, :, None] == np.arange(num_values)).reshape(len(values), -1)
-    tree = DecisionTreeClassifier(criterion="entropy", random_state=0).fit(one_hot, truth).tree_
-    allowed = [np.ones((columns, num_values), dtype=bool)]
-    found = []
-    stack = [(0, allowed[0])]
-    while stack:
-        node, mask = stack.pop()
-        if tree.children_left[node] < 0:
-            share = tree.value[node][0]
-            if share[1] > share[0]:
-                found.append(mask)
-            continue
-        column, value = divmod(int(tree.feature[node]), num_values)
-        without, only = mask.copy(), mask.copy()
-        without[column, value] = False
-        only[column] = False
-        only[column, value] = mask[column, value]
-        stack += [(tree.children_left[node], without), (tree.children_right[node], only)]
-    return _simplified(found, values, truth)
+def _without(views: int, test: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    train = np.setdiff1d(np.arange(views), test)
+    if not len(train):
+        raise UserError("there are no views to learn from")
+    return train, test
 
 
-def _simplified(masks: list[np.ndarray], values: np.ndarray, truth: np.ndarray) -> tuple[Rule, ...]:
-    """Drop conditions and allow values as long as a rule says nothing more that is wrong; drop rules not needed."""
-    columns = np.arange(values.shape[1])
-    chosen = []
-    for mask in masks:
-        applies = mask[columns, values].all(axis=1)
-        wrong = int((applies & ~truth).sum())
-        general = mask.copy()
-        # the condition that most values satisfy says least: try to do without it first
-        for column in sorted(columns.tolist(), key=lambda c: (-mask[c].sum(), c)):
-            wider = general.copy()
-            wider[column] = True
-            if int((wider[columns, values].all(axis=1) & ~truth).sum()) <= wrong:
-                general = wider
-                continue
-            # values never met in this context stay out: a rule should not promise more than was seen
-            for value in np.flatnonzero(~general[column]).tolist():
-                wider = general.copy()
-                wider[column, value] = True
-                covered = wider[columns, values].all(axis=1)
-                if covered.sum() > general[columns, values].all(axis=1).sum() and (covered & ~truth).sum() <= wrong:
-                    general = wider
-        chosen.append(general)
-    covers = [mask[columns, values].all(axis=1) for mask in chosen]
-    rules: list[Rule] = []
-    covered = np.zeros(len(values), dtype=bool)
-    for j in sorted(range(len(chosen)), key=lambda j: (-int((covers[j] & truth).sum()), j)):
-        if not (covers[j] & truth & ~covered).any():
-            continue
-        covered |= covers[j]
-        met = [np.unique(values[:, c]) for c in columns]
-        conditions = tuple(
-            (int(c), tuple(int(v) for v in met[c] if chosen[j][c, v]))
-            for c in columns
-            if not chosen[j][c, met[c]].all()
-        )
-        rules.append(Rule(conditions, int((covers[j] & truth).sum()), int(covers[j].sum())))
-    return tuple(rules)
+def determined(codebook: Codebook, least: int = 1) -> tuple[str, ...]:
+    """The predicates that the code determines.
 
-
-def _applies(rules: Sequence[Rule], values: np.ndarray) -> np.ndarray:
-    result = np.zeros(len(values), dtype=bool)
-    for rule in rules:
-        here = np.ones(len(values), dtype=bool)
-        for column, allowed in rule.conditions:
-            here &= np.isin(values[:, column], allowed)
-        result |= here
-    return result
-
-
-def asp_rules(rules: RuleSet, head: str, atom: str) -> str:
-    """The rules as ASP text.
-
-    Args:
-        rules: rules over factors.
-        head: the head, for example `now(wall_ahead)`.
-        atom: the predicate of factor values, for example `at` for at(F,V).
+    That is: no two views of one code disagree on them; and they hold in at least `least` views and fail in as many.
     """
-    lines = []
-    for rule in rules.rules:
-        # a set of values is a cardinality condition: a pool would multiply into one rule per combination
-        body = ", ".join(
-            f"{atom}({f},{values[0]})"
-            if len(values) == 1
-            else f"1 {{ {'; '.join(f'{atom}({f},{v})' for v in values)} }}"
-            for f, values in rule.conditions
-        )
-        lines.append(f"{head} :- {body}." if body else f"{head}.")
-    return "\n".join(lines)
-
-
-def readable(rules: RuleSet, names: Sequence[str], predicates: bool = False) -> str:
-    """The rules as text for people; `names` of the factors, or of the predicates."""
-    lines = []
-    for rule in rules.rules:
-        parts = [
-            (names[c] if 1 in values else f"not {names[c]}")
-            if predicates
-            else f"{names[c]} in {{{', '.join(map(str, values))}}}"
-            for c, values in rule.conditions
-        ]
-        lines.append(f"{rules.target} if {' and '.join(parts) or 'always'}  (right in {rule.right} of {rule.applies})")
-    scores = f"held-out precision {rules.precision:.3f}, recall {rules.recall:.3f} ({rules.held_out} views)"
-    return "\n".join([*lines, f"{scores}; on all views right in {100 * rules.accuracy:.1f} %"])
-
-
-def summary(codebook: Codebook, held_out: float = 0.25, seed: int = 0) -> dict[str, Any]:
-    """Scores of the rules for every predicate that the codes determine and that varies.
-
-    Returns:
-        `predicates` (how many), `macro_precision`, `macro_recall`, `per_predicate`.
-    """
-    scores = {}
-    for name in determined(codebook):
-        rules = predicate_rules(codebook, name, held_out, seed)
-        scores[name] = {"precision": rules.precision, "recall": rules.recall, "rules": len(rules.rules)}
-    values = list(scores.values())
-    return {
-        "predicates": len(scores),
-        "macro_precision": float(np.mean([s["precision"] for s in values])) if values else 1.0,
-        "macro_recall": float(np.mean([s["recall"] for s in values])) if values else 1.0,
-        "per_predicate": scores,
-    }
-
-
-def determined(codebook: Codebook) -> tuple[str, ...]:
-    """The predicates that hold in some views but not in all, and that no two views of one code disagree on."""
     _, index = codebook.distinct_codes()
     sizes = np.bincount(index)
     names = []
     for p, name in enumerate(codebook.predicate_names):
         truth = codebook.predicates[:, p]
         hits = np.bincount(index, weights=truth)
-        if truth.any() and not truth.all() and ((hits == 0) | (hits == sizes)).all():
+        if min(truth.sum(), (~truth).sum()) >= least and ((hits == 0) | (hits == sizes)).all():
             names.append(name)
     return tuple(names)

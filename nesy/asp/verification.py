@@ -17,7 +17,8 @@ import numpy as np
 from nesy.asp.diagrams import diagram, diagram_facts
 from nesy.asp.encoding import ENCODINGS
 from nesy.asp.facts import LEAST, asp_name
-from nesy.asp.semantics import RuleSet, asp_rules, predicate_rules
+from nesy.asp.rules import RuleSet, asp_rules
+from nesy.asp.semantics import predicate_rules
 from nesy.dbn.codebook import Codebook
 from nesy.dbn.inference import ancestors
 from nesy.dbn.model import TwoSliceDBN

@@ -138,4 +138,4 @@ def test_ready_questions_have_texts():
     assert "Proved" in base.verify("go", "front=1", "same").text
     assert "Not so" in base.verify("swap", "front=1", "same").text
     assert "known to be true" in base.knows(np.array([[1, 0, 0]], dtype=np.uint8), ["wall_ahead"]).text
-    assert "front in {1}" in base.rules("wall_ahead", held_out=0.0).text
+    assert "front = 1" in base.rules("wall_ahead", held_out=0.0).text
