@@ -6,7 +6,7 @@ C order of `[vx, vy]` and given back as `[n, 5, 5]`. Nothing is ever pickled.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -119,11 +119,19 @@ class Experience:
 
     def held_out_maps(self, fraction: float, rng: np.random.Generator) -> np.ndarray:
         """Bool `[n]`: rows of the maps that `split_by_map` would put into its second part."""
-        if not 0 <= fraction < 1:
-            raise UserError(f"the held-out share of the maps must be in [0, 1), not {fraction}")
-        maps = np.unique(self.map_id)
-        count = min(len(maps) - 1, max(1, round(fraction * len(maps)))) if fraction > 0 else 0
-        return np.isin(self.map_id, rng.permutation(maps)[:count])
+        return np.isin(self.map_id, held_out(np.unique(self.map_id), fraction, rng))
+
+
+def held_out(maps: np.ndarray, fraction: float, rng: np.random.Generator) -> np.ndarray:
+    """A share of `maps` (distinct numbers), drawn at random: at least one where there are two or more, never all.
+
+    Raises:
+        UserError: `fraction` is outside [0, 1).
+    """
+    if not 0 <= fraction < 1:
+        raise UserError(f"the held-out share of the maps must be in [0, 1), not {fraction}")
+    count = min(len(maps) - 1, max(1, round(fraction * len(maps)))) if fraction > 0 else 0
+    return rng.permutation(maps)[:count]
 
 
 COLUMNS = tuple(field.name for field in fields(Experience))
@@ -136,7 +144,7 @@ def load_columns(
 
     Args:
         folder: where the parts lie.
-        names: names of `COLUMNS`.
+        names: names of `COLUMNS`, or `source_number`, the place in `SOURCES` (int8; cheaper than the names).
         sources: only rows of these sources; None for all.
 
     Raises:
@@ -146,9 +154,7 @@ def load_columns(
     wanted = None if sources is None else set(sources)
     if wanted is not None and not wanted <= set(SOURCES):
         raise UserError(f"unknown experience source {sorted(wanted - set(SOURCES))}; known: {', '.join(SOURCES)}")
-    parts = sorted(folder.glob("part-*.parquet"))
-    if not parts:
-        raise UserError(f"{folder}: no experience here (no part-*.parquet); make it with: nesy collect")
+    parts = parts_of(folder)
     loaded = [columns for part in parts if (columns := _read_part(part, wanted, names)) is not None]
     if not loaded:
         raise UserError(f"{folder}: no transitions of the sources {sorted(wanted or ())}")
@@ -206,28 +212,86 @@ def count_rows(path: Path) -> int | None:
     return int(metadata.num_rows) if names == set(COLUMNS) else None
 
 
-def _read_part(path: Path, sources: set[str] | None, names: Sequence[str]) -> dict[str, np.ndarray] | None:
-    try:
-        # Read from an open file: a path would be taken for a data set and its folder names for columns.
-        with path.open("rb") as stream:
-            file = pq.ParquetFile(stream)
-            found = file.schema_arrow
-            missing = [name for name in COLUMNS if name not in found.names]
-            wanted = list(dict.fromkeys([*names, *(() if sources is None else ("source",))]))
-            table = None if missing else file.read(columns=wanted)
-    except (OSError, ValueError, pa.ArrowException) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise UserError(f"{path}: damaged, cannot be read as Parquet ({reason}); delete it, collect again") from None
-    if table is None:
+def parts_of(folder: Path | str) -> list[Path]:
+    """The parts of a folder of experience, in the order of their names.
+
+    Raises:
+        UserError: there are none.
+    """
+    parts = sorted(Path(folder).glob("part-*.parquet"))
+    if not parts:
+        raise UserError(f"{folder}: no experience here (no part-*.parquet); make it with: nesy collect")
+    return parts
+
+
+def stream(folder: Path | str, columns: Sequence[str], rows: int = 1 << 16) -> Iterator[dict[str, np.ndarray]]:
+    """Some columns of every part of `folder`, batch by batch, so that few rows are in memory at a time.
+
+    Args:
+        folder: where the parts lie.
+        columns: names of `COLUMNS` but `source`.
+        rows: most rows in a batch.
+
+    Yields:
+        Arrays as in `Experience`.
+
+    Raises:
+        UserError: no parts, or a damaged one.
+    """
+    for path in parts_of(folder):
+        try:
+            with path.open("rb") as source, pq.ParquetFile(source, memory_map=True) as file:
+                side = _checked_side(path, file.schema_arrow)
+                for batch in file.iter_batches(batch_size=rows, columns=list(columns)):
+                    yield {name: _values(path, name, batch.column(name), side, len(batch)) for name in columns}
+        except (OSError, ValueError, pa.ArrowException) as error:
+            raise _damaged(path, error) from None
+
+
+def _damaged(path: Path, error: Exception) -> UserError:
+    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    return UserError(f"{path}: damaged, cannot be read as Parquet ({reason}); delete it, collect again")
+
+
+def _checked_side(path: Path, found: pa.Schema) -> int:
+    """The side of a view, from a part's schema."""
+    missing = [name for name in COLUMNS if name not in found.names]
+    if missing:
         raise UserError(f"{path}: not a part of experience, columns missing: {', '.join(missing)}")
     cells = getattr(found.field("view").type, "list_size", 0)
     side = round(cells**0.5)
     if side * side != cells or not cells or not _same_types(found, schema(cells)):
         raise UserError(f"{path}: not a part of experience, its columns have other types than expected")
-    source = np.zeros(0, dtype=str)
+    return side
+
+
+def _values(path: Path, name: str, column: pa.Array, side: int, count: int) -> np.ndarray:
+    """One column but `source` as an array [count, ...]."""
+    if name in _VIEWS or name in _POSES:
+        values = column.flatten().to_numpy(zero_copy_only=False)
+        values = values.reshape(-1, side, side) if name in _VIEWS else values.reshape(-1, 3)
+    else:
+        values = column.to_numpy(zero_copy_only=False)
+    if len(values) != count or values.dtype == object:
+        raise UserError(f"{path}: damaged, column {name} has missing values")
+    return np.asarray(values)
+
+
+def _read_part(path: Path, sources: set[str] | None, names: Sequence[str]) -> dict[str, np.ndarray] | None:
+    try:
+        # Read from an open file: a path would be taken for a data set and its folder names for columns.
+        with path.open("rb") as stream:
+            file = pq.ParquetFile(stream)
+            side = _checked_side(path, file.schema_arrow)
+            table = file.read(columns=list(dict.fromkeys([*names, *(() if sources is None else ("source",))])))
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise _damaged(path, error) from None
+    source, number = np.zeros(0, dtype="U20"), np.zeros(0, dtype=np.int8)
     if "source" in table.column_names:
         indexed = table["source"].unify_dictionaries().combine_chunks()
-        source = np.asarray(indexed.dictionary.to_pylist(), dtype="U20")[indexed.indices.to_numpy()]
+        known, place = np.asarray(indexed.dictionary.to_pylist(), dtype="U20"), indexed.indices.to_numpy()
+        number = np.array([SOURCES.index(name) if name in SOURCES else -1 for name in known], dtype=np.int8)[place]
+        source = known[place] if "source" in names or sources is not None else source
     keep = None if sources is None else np.isin(source, sorted(sources))
     if keep is not None and not keep.any():
         return None
@@ -235,13 +299,10 @@ def _read_part(path: Path, sources: set[str] | None, names: Sequence[str]) -> di
     for name in names:
         if name == "source":
             values = source
-        elif name in _VIEWS or name in _POSES:
-            values = table[name].combine_chunks().flatten().to_numpy(zero_copy_only=False)
-            values = values.reshape(-1, side, side) if name in _VIEWS else values.reshape(-1, 3)
+        elif name == "source_number":
+            values = number
         else:
-            values = table[name].to_numpy()
-        if len(values) != table.num_rows:
-            raise UserError(f"{path}: damaged, column {name} has missing values")
+            values = _values(path, name, table[name].combine_chunks(), side, table.num_rows)
         columns[name] = values if keep is None else values[keep]
     return columns
 

@@ -64,16 +64,20 @@ def view_keys(views: np.ndarray) -> np.ndarray:
 
 
 def unobstructed(experience: Experience) -> np.ndarray:
-    """Bool [n]: steps whose next view depends on the own view and action alone.
+    """Bool [n]: steps whose next view depends on the own view and action alone; see `free_ahead`."""
+    return free_ahead(experience.configuration, experience.view.shape[1])
 
-    Another agent in the cell ahead blocks the way forward although the view, from which agents are removed,
-    does not show it. Which steps that concerns is read from the configuration; what follows from it belongs to
-    the planner's model, not to the model of the view.
+
+def free_ahead(configurations: np.ndarray, view_size: int) -> np.ndarray:
+    """Bool [n]: no other agent is in the cell ahead.
+
+    One that is there blocks the way forward although the view, from which agents are removed, does not show it.
+    Which steps that concerns is read from the configuration; what follows from it belongs to the planner's model,
+    not to the model of the view.
     """
-    side = experience.view.shape[1]
-    pose = experience.configuration.astype(np.int64) - 1
+    pose = configurations.astype(np.int64) - 1
     cell = pose // 4
-    ahead = (pose >= 0) & (cell // side == side // 2) & (cell % side == side - 2)
+    ahead = (pose >= 0) & (cell // view_size == view_size // 2) & (cell % view_size == view_size - 2)
     return ~ahead
 
 
@@ -104,7 +108,7 @@ def transitions_of(
     # One entry per (map, transition), then one per transition with the number of maps as its weight.
     per_map = np.unique(edge[free] * (int(place.max(initial=0)) + 1) + place[free])
     edges, weight = np.unique(per_map // (int(place.max(initial=0)) + 1), return_counts=True)
-    return _from_edges(distinct, visits, edges, weight)
+    return from_edges(distinct, visits, edges, weight)
 
 
 def with_mirror(transitions: Transitions, views: np.ndarray | None = None) -> Transitions:
@@ -139,7 +143,7 @@ def with_mirror(transitions: Transitions, views: np.ndarray | None = None) -> Tr
     edges, place = np.unique(edge, return_inverse=True)
     weight = np.bincount(place, np.tile(t.weight, 2)).astype(np.int64)
     visits = np.bincount(index, np.tile(t.visits, 2), minlength=len(unique)).astype(np.int64)
-    return _from_edges(views, visits, edges, weight)
+    return from_edges(views, visits, edges, weight)
 
 
 def reference_transitions(domain: Domain, variant: str, task: str = "following") -> Transitions | None:
@@ -155,10 +159,11 @@ def reference_transitions(domain: Domain, variant: str, task: str = "following")
     edge = (index[: len(before)] * 4 + action) * len(unique) + index[len(before) :]
     edges, weight = np.unique(edge, return_counts=True)
     distinct = np.concatenate([before, after])[first]
-    return _from_edges(distinct, np.bincount(index, minlength=len(unique)), edges, weight)
+    return from_edges(distinct, np.bincount(index, minlength=len(unique)), edges, weight)
 
 
-def _from_edges(views: np.ndarray, visits: np.ndarray, edges: np.ndarray, weight: np.ndarray) -> Transitions:
+def from_edges(views: np.ndarray, visits: np.ndarray, edges: np.ndarray, weight: np.ndarray) -> Transitions:
+    """Transitions from their numbers `(source * 4 + action) * V + target`, int64 [E] ascending, and weights [E]."""
     total = len(views)
     return Transitions(
         views=np.ascontiguousarray(views),

@@ -1,0 +1,71 @@
+"""Steps as numbers of distinct views: the same transitions as from experience in memory, nothing left on the disk."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nesy.errors import UserError
+from nesy.experience import COLUMNS, Experience, write_part
+from nesy.world_model import columns as module
+from nesy.world_model.columns import Columns
+from nesy.world_model.distinct import Transitions, transitions_of
+
+
+@pytest.fixture
+def folder(tmp_path: Path, toy: Experience) -> Path:
+    """The toy world's experience in two parts."""
+    for number, rows in enumerate((slice(0, 700), slice(700, None))):
+        part = {name: getattr(toy, name)[rows] for name in COLUMNS}
+        write_part(tmp_path / "experience" / f"part-{number:05d}.parquet", part)
+    return tmp_path / "experience"
+
+
+def assert_same(found: Transitions, expected: Transitions) -> None:
+    for name in ("views", "visits", "source", "action", "target", "weight"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
+
+
+def test_mapped_columns_hold_every_step_and_leave_no_file(folder: Path, toy: Experience, tmp_path: Path) -> None:
+    columns = Columns.mapped(folder, tmp_path / "scratch")
+    assert not list((tmp_path / "scratch").iterdir())
+    assert isinstance(columns.source, np.memmap)
+    np.testing.assert_array_equal(columns.views[columns.source], toy.view)
+    np.testing.assert_array_equal(columns.views[columns.target], toy.next_view)
+    np.testing.assert_array_equal(columns.maps[columns.place], toy.map_id)
+    np.testing.assert_array_equal(columns.action, toy.action)
+
+
+def test_transitions_are_those_of_experience_in_memory(
+    folder: Path, toy: Experience, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "CHUNK", 333)
+    columns = Columns.mapped(folder, tmp_path / "scratch")
+    further = np.full((1, 5, 5), 2, dtype=np.uint8)
+    assert_same(columns.transitions(), transitions_of(toy))
+    assert_same(columns.transitions(views=further), transitions_of(toy, views=further))
+    apart = columns.held_out(0.25, np.random.default_rng(5))
+    rows = toy.held_out_maps(0.25, np.random.default_rng(5))
+    np.testing.assert_array_equal(columns.maps[apart], np.unique(toy.map_id[rows]))
+    assert_same(columns.transitions(~apart, further), transitions_of(toy.select(~rows), views=further))
+    np.testing.assert_array_equal(columns.rows(apart), np.flatnonzero(rows))
+
+
+def test_views_of_many_cells_and_blocked_steps(toy: Experience) -> None:
+    import dataclasses
+
+    wide = np.zeros((len(toy), 7, 7), dtype=np.uint8)
+    wide[:, 1:6, 2:] = toy.view
+    after = np.zeros_like(wide)
+    after[:, 1:6, 2:] = toy.next_view
+    ahead = np.zeros(len(toy), dtype=np.int16)
+    ahead[::3] = 1 + (3 * 7 + 5) * 4
+    experience = dataclasses.replace(toy, view=wide, next_view=after, configuration=ahead)
+    columns = Columns.of(experience)
+    assert_same(columns.transitions(), transitions_of(experience))
+    assert (np.flatnonzero(~columns.free) == np.arange(0, len(toy), 3)).all()
+
+
+def test_no_experience_is_told(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no experience"):
+        Columns.mapped(tmp_path, tmp_path / "scratch")
