@@ -9,7 +9,7 @@ Other architectures are fitted (nesy.dbn.fitting).
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
@@ -23,6 +23,11 @@ from nesy.errors import UserError
 
 if TYPE_CHECKING:
     from nesy.run_folder import RunFolder
+
+COLUMNS = ("view", "action", "next_view", "reward", "terminated", "t", "source_number")
+"""Columns of experience that extraction reads."""
+OWN_TASK = "crossing-"
+"""How the names of sources of experience begin in which nobody else is about."""
 
 Marginals = Callable[[np.ndarray, int], np.ndarray]
 """Codes uint8 [n, N] and an action -> marginals of the next factors, float64 [n, N, K]."""
@@ -156,43 +161,62 @@ def extract_run(run: RunFolder, domain_name: str) -> dict[str, Any]:
     """
     from domains.core import load_domain
     from nesy.dbn.measures import fidelity
-    from nesy.experience import Experience
+    from nesy.dbn.step_learning import with_observation, with_outcomes
+    from nesy.experience import SOURCES, load_columns
     from nesy.world_model import SymbolicCodec, load_world_model
 
     domain = load_domain(domain_name)
-    experience = Experience.load(run.experience)
-    if not len(experience):
+    experience = load_columns(run.experience, COLUMNS)
+    if not len(experience["action"]):
         raise UserError(f"{run.experience}: holds no transitions")
     model = load_world_model(run.world_model)
     codec = SymbolicCodec(model)
     transitions = encode(experience, codec)
     codebook = Codebook.build(transitions.views, transitions.view_codes, transitions.view_counts, domain.predicates)
+    started = experience["t"] == 0
     described: dict[str, Any] = {
         "action_names": domain.spec.action_names,
-        "initial_codes": transitions.codes[experience.t == 0] if (experience.t == 0).any() else None,
+        "initial_codes": transitions.codes[started] if started.any() else None,
         "meanings": value_meanings(codebook, int(model.num_values)),
         "provenance": {
             "source": "network",
             "domain": domain_name,
             "architecture": str(model.architecture),
+            "seed": _seed(run),
             "world_model_sha256": _digest(run.world_model / "model.safetensors"),
-            "transitions": len(experience),
+            "transitions": len(experience["action"]),
         },
     }
-    taken = (transitions.codes, transitions.actions, transitions.next_codes)
+    *distinct, kind = transitions.numbered()
+    weights = np.bincount(kind)
     if isinstance(model, Conditionals):
-        *distinct, weights = transitions.distinct()
         dbn = extract(model, *distinct, weights=weights, **described)
     else:
         from nesy.dbn.fitting import from_callable
 
-        dbn = from_callable(network_marginals(codec), *taken, num_values=int(model.num_values), **described)
+        dbn = from_callable(
+            network_marginals(codec), *distinct, weights=weights, num_values=int(model.num_values), **described
+        )
+    dbn = with_observation(dbn, codebook)
+    # reward and end of the own task alone: those of a task with somebody else depend on more than the own code
+    sources = [number for number, name in enumerate(SOURCES) if name.startswith(OWN_TASK)]
+    own = np.isin(experience["source_number"], sources)
+    if own.any():
+        dbn = with_outcomes(dbn, distinct, kind[own], experience["reward"][own], experience["terminated"][own])
     codebook.save(run.dbn)
     # last: the step counts as done when model.json is there
     dbn.save(run.dbn)
     return fidelity(
         TwoSliceDBN.load(run.dbn), model if isinstance(model, Conditionals) else network_marginals(codec), transitions
     )
+
+
+def _seed(run: RunFolder) -> int | None:
+    if not run.config.is_file():
+        return None
+    from nesy.run_folder import read_json
+
+    return int(read_json(run.config).get("seed", 0))
 
 
 def network_marginals(codec: Any) -> Marginals:
@@ -222,19 +246,37 @@ class Transitions:
         self.actions = np.asarray(actions, dtype=np.int64)
 
     def distinct(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Distinct transitions: codes uint8 [n, N], actions int64 [n], next codes uint8 [n, N], counts int64 [n]."""
+        """Distinct transitions: codes uint8 [D, N], actions int64 [D], next codes uint8 [D, N], counts int64 [D]."""
+        *kinds, index = self.numbered()
+        return *kinds, np.bincount(index)
+
+    def numbered(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Distinct transitions as in `distinct`, and which of them every transition is, int64 [n]."""
         first, code_of_view, _ = unique_rows(self.view_codes)
         codes, number = self.view_codes[first], len(first)
         base = int(self.actions.max(initial=0)) + 1
         key = (code_of_view[self.view_index] * base + self.actions) * number + code_of_view[self.next_view_index]
-        kinds, counts = np.unique(key, return_counts=True)
+        kinds, index = _numbered(key, number * base * number)
         before, after = kinds // number, kinds % number
-        return codes[before // base], before % base, codes[after], counts
+        return codes[before // base], before % base, codes[after], index
 
 
-def encode(experience: Any, codec: Any) -> Transitions:
-    """Every transition of `experience` in the codes of `codec`."""
-    return Transitions(experience.view, experience.action, experience.next_view, codec.codes)
+def _numbered(keys: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
+    """Distinct keys in order, and the number of each; without sorting where their limit allows it."""
+    if limit > 1 << 24:
+        kinds, index = np.unique(keys, return_inverse=True)
+        return kinds, index.reshape(-1)
+    met = np.zeros(limit, dtype=bool)
+    met[keys] = True
+    kinds = np.flatnonzero(met)
+    rank = np.zeros(limit, dtype=np.int64)
+    rank[kinds] = np.arange(len(kinds))
+    return kinds, rank[keys]
+
+
+def encode(experience: Mapping[str, np.ndarray], codec: Any) -> Transitions:
+    """Every transition of some columns of experience in the codes of `codec`."""
+    return Transitions(experience["view"], experience["action"], experience["next_view"], codec.codes)
 
 
 def _digest(path: Path) -> str:

@@ -62,7 +62,8 @@ def from_experience(
             chosen = learn_parents(columns, child, weights.astype(float), num_values, (n, n + i), search)
             parents[-1].append(chosen)
             tables[-1].append(_count(columns[:, list(chosen)], child, weights, num_values, prior_count))
-    return _assemble(tables, parents, n, (codes, np.asarray(actions), next_codes), num_values, described)
+    taken = (codes, np.asarray(actions), next_codes, np.ones(len(codes), dtype=np.int64))
+    return _assemble(tables, parents, n, taken, num_values, described)
 
 
 def from_callable(
@@ -72,6 +73,7 @@ def from_callable(
     next_codes: np.ndarray,
     *,
     num_values: int,
+    weights: np.ndarray | None = None,
     search: Search | None = None,
     prior_count: float = 1e-3,
     action_names: Sequence[str] | None = None,
@@ -89,6 +91,7 @@ def from_callable(
         actions: integers [n], what was done there (for the counts).
         next_codes: uint8 [n, N] (for the counts).
         num_values: K.
+        weights: int64 [n], how often each transition was met; once each by default.
         search: how parents are chosen; by default BDeu and up to 4 parents.
         prior_count: transitions that each row's prior counts as.
         action_names: A names.
@@ -100,8 +103,9 @@ def from_callable(
     """
     search = search or Search()
     _check(np.asarray(codes), num_values)
-    first, _, weights = unique_rows(codes)
-    kinds = np.asarray(codes)[first]
+    often = np.ones(len(codes), dtype=np.int64) if weights is None else weights
+    first, index, _ = unique_rows(codes)
+    kinds, visits = np.asarray(codes)[first], np.bincount(index, often)
     n = kinds.shape[1]
     number = len(action_names) if action_names is not None else num_actions or int(np.max(actions)) + 1
     parents: list[list[tuple[int, ...]]] = []
@@ -112,11 +116,11 @@ def from_callable(
         tables.append([])
         for i in range(n):
             child = predicted[:, i] / predicted[:, i].sum(axis=1, keepdims=True)
-            chosen = learn_parents(kinds, child, weights.astype(float), num_values, (n, n), search)
+            chosen = learn_parents(kinds, child, visits, num_values, (n, n), search)
             parents[-1].append(chosen)
-            tables[-1].append(_count(kinds[:, list(chosen)], child, weights, num_values, prior_count))
+            tables[-1].append(_count(kinds[:, list(chosen)], child, visits, num_values, prior_count))
     described["action_names"] = action_names
-    taken = (np.asarray(codes), np.asarray(actions), np.asarray(next_codes))
+    taken = (np.asarray(codes), np.asarray(actions), np.asarray(next_codes), often)
     return _assemble(tables, parents, n, taken, num_values, described)
 
 
@@ -148,7 +152,7 @@ def _assemble(
     tables: list[list[np.ndarray]],
     parents: list[list[tuple[int, ...]]],
     num_factors: int,
-    taken: tuple[np.ndarray, np.ndarray, np.ndarray],
+    taken: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
     num_values: int,
     described: dict[str, Any],
 ) -> TwoSliceDBN:

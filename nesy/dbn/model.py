@@ -18,15 +18,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nesy.dbn import storage
-from nesy.dbn.rows import distinct_rows, expanded_rows, scattered_counts
+from nesy.dbn.step_tables import NAMES, StepTable
 from nesy.errors import UserError
 
 if TYPE_CHECKING:
     import networkx
 
-FORMAT = "nesy-2dbn"
-VERSION = 1
 MAX_ROWS = 1 << 25
 
 Parents = tuple[tuple[tuple[int, ...], ...], ...]
@@ -59,7 +56,9 @@ class TwoSliceDBN:
     provenance: dict[str, Any] = field(default_factory=dict)
     """Where the model comes from: run, seed, hash of the network, ... (JSON values)."""
     tables: dict[str, np.ndarray] = field(default_factory=dict)
-    """Further tables over codes (observation, reward, termination), see nesy.dbn.codebook."""
+    """What experience says besides: `codes` uint8 [C, N] met, `taken` int64 [A], `changed` int64 [A, N]."""
+    step_tables: dict[str, StepTable] = field(default_factory=dict)
+    """Observation model, reward and termination (see nesy.dbn.step_tables), as far as they are known."""
 
     # ---------------------------------------------------------------- building
     @classmethod
@@ -134,6 +133,10 @@ class TwoSliceDBN:
         ends = np.cumsum(sizes.reshape(-1))
         object.__setattr__(self, "offsets", (ends - sizes.reshape(-1)).reshape(sizes.shape).astype(np.int64))
         self._check_tables(int(ends[-1]))
+        for name, table in self.step_tables.items():
+            if name not in NAMES:
+                raise UserError(f"no step table is called '{name}'; they are {', '.join(NAMES)}")
+            table.check(self.num_factors, self.num_values, self.num_actions)
 
     offsets: np.ndarray = field(init=False, repr=False)
     """int64 [A, N]: first row of each table in `probabilities`."""
@@ -313,29 +316,9 @@ class TwoSliceDBN:
     # ---------------------------------------------------------------- files
     def save(self, path: Path | str) -> None:
         """Write model.json and tables.npz into the folder `path`."""
-        document = {
-            "format": FORMAT,
-            "version": VERSION,
-            "factor_names": list(self.factor_names),
-            "num_values": self.num_values,
-            "action_names": list(self.action_names),
-            "order": list(self.order),
-            "parents_now": [[list(ps) for ps in per_action] for per_action in self.parents_now],
-            "parents_next": [[list(ps) for ps in per_action] for per_action in self.parents_next],
-            "value_meanings": [list(texts) for texts in self.value_meanings],
-            "provenance": self.provenance,
-        }
-        met = np.flatnonzero(self.row_counts)
-        distinct, index = distinct_rows(self.probabilities)
-        arrays = {
-            "distinct_rows": distinct,
-            "row_index": index,
-            "met_rows": met,
-            "met_counts": self.row_counts[met],
-            "initial": self.initial,
-        }
-        extra = {f"table_{name}": table for name, table in self.tables.items()}
-        storage.save(Path(path), "model", "tables", document, arrays | extra)
+        from nesy.dbn.model_files import save
+
+        save(self, Path(path))
 
     @classmethod
     def load(cls, path: Path | str) -> TwoSliceDBN:
@@ -344,31 +327,9 @@ class TwoSliceDBN:
         Raises:
             UserError: a file is missing, damaged, or does not hold a 2DBN.
         """
-        path = Path(path)
-        if not path.is_dir():
-            raise UserError(f"{path}: no such folder (a 2DBN is a folder with model.json and tables.npz)")
-        document, arrays = storage.load(path, "model", FORMAT)
-        if document.get("version") != VERSION:
-            raise UserError(f"{path / 'model.json'}: version {document.get('version')!r}, this program reads {VERSION}")
-        try:
-            return cls(
-                factor_names=_strings(document["factor_names"]),
-                num_values=int(document["num_values"]),
-                action_names=_strings(document["action_names"]),
-                parents_now=_parents(document["parents_now"]),
-                parents_next=_parents(document["parents_next"]),
-                order=tuple(int(i) for i in document["order"]),
-                probabilities=expanded_rows(arrays["distinct_rows"], arrays["row_index"]),
-                row_counts=scattered_counts(arrays["met_rows"], arrays["met_counts"], len(arrays["row_index"])),
-                initial=arrays["initial"],
-                value_meanings=tuple(_strings(texts) for texts in document["value_meanings"]),
-                provenance=dict(document["provenance"]),
-                tables={k.removeprefix("table_"): v for k, v in arrays.items() if k.startswith("table_")},
-            )
-        except UserError as error:
-            raise UserError(f"{path / 'model.json'}: {error}") from None
-        except (KeyError, TypeError, ValueError, OverflowError, IndexError) as error:
-            raise UserError(f"{path / 'model.json'}: does not describe a 2DBN ({error!r})") from None
+        from nesy.dbn.model_files import load
+
+        return load(Path(path))
 
     # ---------------------------------------------------------------- checks
     def _codes(self, code: np.ndarray) -> np.ndarray:
@@ -402,13 +363,3 @@ def topological_order(parents_next: Parents, num_factors: int) -> tuple[int, ...
         for i in ready:
             del waiting[i]
     return tuple(order)
-
-
-def _strings(value: Any) -> tuple[str, ...]:
-    if not isinstance(value, list) or not all(isinstance(text, str) for text in value):
-        raise ValueError("expected a list of texts")
-    return tuple(value)
-
-
-def _parents(value: Any) -> Parents:
-    return tuple(tuple(tuple(int(p) for p in ps) for ps in per_action) for per_action in value)

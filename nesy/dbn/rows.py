@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+_FEW = 20_000
+"""Fewer rows than this are sorted; more are hashed by a compiled pass."""
+
 
 def unique_rows(table: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Distinct rows in lexicographic order.
@@ -19,24 +22,26 @@ def unique_rows(table: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     n, width = table.shape
     if width == 0:
         return np.zeros(min(n, 1), np.int64), np.zeros(n, np.int64), np.full(min(n, 1), n)
-    padded = np.zeros((n, -(-width // 8) * 8), dtype=np.uint8)
-    padded[:, :width] = table
+    if n < _FEW:
+        return _sorted(table)
+    from nesy.dbn.row_hashing import number_rows
+
+    first, index, counts = number_rows(np.ascontiguousarray(table))
+    order, rank, _ = _sorted(table[first])
+    return first[order], rank[index], counts[order]
+
+
+def _sorted(table: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    padded = np.zeros((len(table), -(-table.shape[1] // 8) * 8), dtype=np.uint8)
+    padded[:, : table.shape[1]] = table
     # eight columns are one big-endian number, so numbers sort as the rows do
     words = padded.view(">u8").astype(np.uint64)
-    if words.shape[1] == 1:
-        _, first, index, counts = np.unique(words[:, 0], return_index=True, return_inverse=True, return_counts=True)
-        return first, index.reshape(-1), counts
-    odd = np.random.default_rng(0).integers(1 << 62, size=words.shape[1], dtype=np.uint64) * np.uint64(2)
-    mixed = ((words ^ (words >> np.uint64(31))) * (odd + np.uint64(1))).sum(axis=1, dtype=np.uint64)
-    _, first, index, counts = np.unique(mixed, return_index=True, return_inverse=True, return_counts=True)
-    index = index.reshape(-1)
-    if not np.array_equal(words[first[index]], words):  # two rows with one hash
-        _, first, index, counts = np.unique(padded, axis=0, return_index=True, return_inverse=True, return_counts=True)
-        return first, index.reshape(-1), counts
-    order = np.lexsort(words[first].T[::-1])
-    rank = np.empty(len(order), dtype=np.int64)
-    rank[order] = np.arange(len(order))
-    return first[order], rank[index], counts[order]
+    order = np.lexsort(words.T[::-1])
+    new = np.ones(len(table), dtype=bool)
+    new[1:] = (words[order[1:]] != words[order[:-1]]).any(axis=1)
+    index = np.empty(len(table), dtype=np.int64)
+    index[order] = np.cumsum(new) - 1
+    return order[new], index, np.bincount(index)
 
 
 def distinct_rows(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -54,9 +54,9 @@ def learn_parents(
 
     Args:
         candidates: integers [n, C]: values of the possible parents.
-        child: float [n, K]: distribution of the child in every transition (one-hot where it was observed).
+        child: float [n, M]: distribution of the child in every transition (one-hot where it was observed).
         weights: float [n]: how much each transition counts.
-        num_values: K.
+        num_values: K, values that a candidate may have.
         limits: (S, C): the first S candidates belong to slice t, the others to slice t+1.
         search: what is searched.
 
@@ -74,7 +74,7 @@ def learn_parents(
     first, index, _ = unique_rows(candidates)
     merged = candidates[first]
     counts = np.stack(
-        [np.bincount(index, weights * child[:, k], minlength=len(merged)) for k in range(num_values)], axis=1
+        [np.bincount(index, weights * child[:, k], minlength=len(merged)) for k in range(child.shape[1])], axis=1
     )
 
     def allowed(chosen: tuple[int, ...]) -> bool:
@@ -120,14 +120,15 @@ def _score(values: np.ndarray, counts: np.ndarray, num_values: int, search: Sear
         row = row * num_values + values[:, column]
     _, index = np.unique(row, return_inverse=True)
     index = index.reshape(-1)
-    table = np.stack([np.bincount(index, counts[:, k]) for k in range(num_values)], axis=1)
+    size = counts.shape[1]
+    table = np.stack([np.bincount(index, counts[:, k]) for k in range(size)], axis=1)
     totals = table.sum(axis=1)
     if search.score == "bdeu":
-        per_row, per_entry = search.sample_size / q, search.sample_size / (q * num_values)
+        per_row, per_entry = search.sample_size / q, search.sample_size / (q * size)
         rows = gammaln(per_row) - gammaln(per_row + totals)
         entries = gammaln(per_entry + table) - gammaln(per_entry)
         return float(rows.sum() + entries.sum())
     with np.errstate(divide="ignore", invalid="ignore"):
         likelihood = float(np.where(table > 0, table * np.log(table / totals[:, None]), 0.0).sum())
-    free = q * (num_values - 1)
+    free = q * (size - 1)
     return likelihood - (0.5 * np.log(max(totals.sum(), 2.0)) if search.score == "bic" else 1.0) * free

@@ -9,7 +9,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from nesy.dbn.codebook import Codebook
-from nesy.dbn.model import TwoSliceDBN, distinct_rows
+from nesy.dbn.model import TwoSliceDBN
+from nesy.dbn.rows import distinct_rows
 from nesy.errors import UserError
 from tests.nesy.dbn.models import random_dbn
 from tests.nesy.dbn.toy import toy
@@ -33,6 +34,8 @@ def same(left: TwoSliceDBN, right: TwoSliceDBN) -> bool:
         and all(np.array_equal(getattr(left, name), getattr(right, name)) for name in arrays)
         and left.tables.keys() == right.tables.keys()
         and all(np.array_equal(left.tables[name], right.tables[name]) for name in left.tables)
+        and left.step_tables.keys() == right.step_tables.keys()
+        and all(left.step_tables[name].same_as(right.step_tables[name]) for name in left.step_tables)
     )
 
 
