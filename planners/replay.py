@@ -338,7 +338,7 @@ def _senses(
 
 def _thoughts(agent: Agent, percepts: Percepts, i: int) -> dict[str, Any]:
     """The values that the agent weighed: of a value network, or of a search with the top of its tree."""
-    policy = getattr(agent, "policy", None)
+    policy: Any = getattr(agent, "policy", None)
     if hasattr(policy, "values"):
         one = Percepts(*(part[i : i + 1] for part in percepts))
         return {"q": [round(float(value), 3) for value in policy.values(one)[0]]}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import json
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -34,3 +35,19 @@ def figure(svg: str, caption: str, label: str) -> str:
 def figures_table(values: dict[str, Any], caption: str) -> str:
     """Nested figures of summary.json, one row each."""
     return table(("figure", "value"), [(name, number(value)) for name, value in flat(values)], caption)
+
+
+def embedded_json(identifier: str, value: Any) -> str:
+    """Data for the page's scripts: JSON in an element that is never run.
+
+    Every character with which markup could begin or end is written as an escape of JSON, so that no text of a run
+    can leave the element.
+
+    Args:
+        identifier: the element's id.
+        value: JSON values, without NaN and infinities.
+    """
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
+    for character in "<>&\u2028\u2029":
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    return f'<script type="application/json" id="{html.escape(identifier)}">{text}</script>'

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import html
 from importlib.resources import files
 from pathlib import Path
@@ -10,6 +12,8 @@ from string import Template
 from nesy.progress import SILENT, Progress
 from nesy.report.sections import SECTIONS
 from nesy.run_folder import RunFolder, atomic_path
+
+SCRIPTS = ("ui.js", "graph.js", "replay.js", "start.js")
 
 
 def write_report(run: RunFolder, progress: Progress = SILENT) -> Path:
@@ -33,12 +37,15 @@ def write_report(run: RunFolder, progress: Progress = SILENT) -> Path:
             task.advance()
     made = summary["provenance"]
     templates = files("nesy.report") / "templates"
+    script = "\n".join(['"use strict";', *((templates / name).read_text(encoding="utf-8") for name in SCRIPTS)])
     page = Template((templates / "page.html").read_text(encoding="utf-8")).substitute(
         title=html.escape(f"nesy run: {run.path.name}"),
         subtitle=html.escape(f"Variant {made['variant']}, preset {made['preset']}, seed {made['seed']}."),
         style=(templates / "style.css").read_text(encoding="utf-8"),
         navigation="\n".join(navigation),
         sections="\n".join(sections),
+        script=script,
+        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
         footer="Every number on this page is in summary.json beside it.",
     )
     with atomic_path(run.report) as temporary:

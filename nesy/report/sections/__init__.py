@@ -5,6 +5,15 @@ A section is a module with ANCHOR, TITLE and `make(run, summary) -> HTML`, made 
 
 from types import ModuleType
 
-from nesy.report.sections import belief, comparison, dbn, learning, provenance, world_model
+from nesy.report.sections import belief, comparison, dbn, graph, learning, provenance, replays, world_model
 
-SECTIONS: tuple[ModuleType, ...] = (comparison, learning, belief, world_model, dbn, provenance)
+SECTIONS: tuple[ModuleType, ...] = (
+    comparison,
+    learning,
+    replays,
+    belief,
+    world_model,
+    graph,
+    dbn,
+    provenance,
+)
