@@ -244,6 +244,8 @@ def stream(folder: Path | str, columns: Sequence[str], rows: int = 1 << 16) -> I
                 side = _checked_side(path, file.schema_arrow)
                 for batch in file.iter_batches(batch_size=rows, columns=list(columns)):
                     yield {name: _values(path, name, batch.column(name), side, len(batch)) for name in columns}
+        except UserError:
+            raise
         except (OSError, ValueError, pa.ArrowException) as error:
             raise _damaged(path, error) from None
 

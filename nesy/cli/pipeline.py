@@ -218,14 +218,13 @@ class Pipeline:
         self.run.require("collect")
         if not self.run.has("train"):
             from domains.core import load_domain
-            from nesy.experience import Experience
             from nesy.world_model import train
 
             domain = load_domain(self.config.domain)
             metrics = self._timed(
                 "train",
                 lambda: train(
-                    Experience.load(self.run.experience),
+                    self.run.experience,
                     self.config.train,
                     self.run.world_model,
                     seed=self.config.seed,

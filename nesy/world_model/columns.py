@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nesy.errors import UserError
 from nesy.experience import Experience, count_rows, held_out, parts_of, stream
 from nesy.world_model.distinct import Transitions, free_ahead, from_edges, view_keys
 
@@ -60,7 +61,11 @@ class Columns:
 
     @classmethod
     def of(cls, experience: Experience) -> Columns:
-        """Columns in memory, of experience in memory."""
+        """Columns in memory, of experience in memory.
+
+        Raises:
+            UserError: there is none.
+        """
         rows = {name: np.empty(len(experience), dtype=kind) for name, kind in _TYPES.items()}
         return cls._filled(rows, ({name: getattr(experience, name) for name in _READ},))
 
@@ -83,6 +88,8 @@ class Columns:
     @classmethod
     def _filled(cls, rows: dict[str, np.ndarray], batches: Iterable[Mapping[str, np.ndarray]]) -> Columns:
         """Number views and maps as they come, then anew in ascending order."""
+        if not len(rows["action"]):
+            raise UserError("no experience to train on; collect some with: nesy collect")
         views, maps = _Numbering(), _Numbering()
         shown: list[np.ndarray] = []
         end = 0

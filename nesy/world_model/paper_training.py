@@ -1,4 +1,7 @@
-"""Training of the `paper` architecture as published: Adam decayed per epoch, Gumbel-softmax at a fixed temperature."""
+"""Training of the `paper` architecture as published: Adam decayed per epoch, Gumbel-softmax at a fixed temperature.
+
+An epoch draws 400 mini-batches from the steps as they were made, so a view counts as often as it was met.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +16,15 @@ from torch import Tensor
 from nesy.config import TrainConfig
 from nesy.world_model import losses
 from nesy.world_model.codec import SymbolicCodec
-from nesy.world_model.distinct import Transitions
-from nesy.world_model.gates import next_gates, view_gates
+from nesy.world_model.columns import Columns
+from nesy.world_model.distinct import Transitions, view_keys
+from nesy.world_model.gates import evaluate
+from nesy.world_model.imagination import imagined_rollouts
 from nesy.world_model.paper import PaperWorldModel
 from nesy.world_model.symbolic_training import optimizer_tensors, restore_optimizer
 
 STEPS = 400
-"""Mini-batches of an epoch: what 3,000 episodes give at 500 transitions each."""
+"""Mini-batches of an epoch: with 500 transitions each, about the steps of 3,000 episodes in the publication."""
 
 
 class PaperTrainer:
@@ -30,21 +35,35 @@ class PaperTrainer:
         config: TrainConfig,
         seed: int,
         everything: Transitions,
-        training: Transitions,
+        columns: Columns,
+        apart: np.ndarray,
         held_out: Transitions | None,
     ) -> None:
-        self.config, self.everything, self.held_out = config, everything, held_out
-        self.training = training
+        """Prepare the training.
+
+        Args:
+            config: how to learn.
+            seed: of everything random.
+            everything: indexes every view.
+            columns: the steps.
+            apart: bool [M], the maps kept out of training.
+            held_out: the transitions on those; None where there are none.
+        """
+        self.config, self.seed, self.everything, self.held_out = config, seed, everything, held_out
+        self.columns, self.apart = columns, apart
+        self.rows = columns.rows(~apart)
         self.device = torch.device(config.device)
         self.generator = torch.Generator().manual_seed(seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.model = PaperWorldModel(view_size=everything.views.shape[1])
         self.model.to(self.device)
-        self.weights = losses.class_weights(training.views, training.visits).to(self.device)
+        learned = columns.transitions(~apart)
+        self.weights = losses.class_weights(learned.views, learned.visits).to(self.device)
         self.optimizer = torch.optim.Adam(self.model.parameters(), lr=config.learning_rate)
-        self.views = torch.as_tensor(everything.views, device=self.device)
-        self.chances = torch.as_tensor(training.weight, dtype=torch.float64)
+        # The columns' views are numbered among themselves; `everything` may hold more.
+        index = np.searchsorted(view_keys(everything.views), view_keys(columns.views))
+        self.views = torch.as_tensor(everything.views[index], device=self.device)
         self.held_out_figures: dict[str, Any] = {}
         self.epoch, self.finished = 0, False
 
@@ -56,43 +75,50 @@ class PaperTrainer:
         """Do one epoch; `elapsed` is the time used so far, in seconds."""
         for group in self.optimizer.param_groups:
             group["lr"] = self.config.learning_rate * self.config.learning_rate_decay**self.epoch
-        t = self.training
-        totals = {"loss": 0.0, "reconstruction": 0.0, "kl": 0.0, "forward": 0.0, "inverse": 0.0}
+        totals: dict[str, Tensor] = {}
         for _ in range(STEPS):
-            rows = torch.multinomial(self.chances, self.config.batch_size, True, generator=self.generator).numpy()
-            parts = self._loss(t.source[rows], t.action[rows], t.target[rows])
+            drawn = torch.randint(len(self.rows), (self.config.batch_size,), generator=self.generator).numpy()
+            parts = self._loss(self.rows[drawn])
             self.optimizer.zero_grad(set_to_none=True)
             parts["loss"].backward()
             self.optimizer.step()
             for name, value in parts.items():
-                totals[name] += float(value.detach()) / STEPS
+                totals[name] = totals.get(name, torch.zeros((), device=self.device)) + value.detach() / STEPS
         self.epoch += 1
-        limit = self.config.time_limit or math.inf
-        self.finished = self.epoch >= self.config.epochs or elapsed >= 0.95 * limit
-        target = self.everything if self.held_out is None else self.held_out
         codec = SymbolicCodec(self.model)
-        figures = view_gates(codec, target.views)
-        if self.finished and self.held_out is not None:
-            self.held_out_figures = {**figures, **next_gates(codec, self.held_out)}
+        gates = evaluate(codec, self.everything)
+        figures, holds = gates, all(gates["passed"].values())
+        if self.held_out is not None:
+            figures = evaluate(codec, self.held_out)
+            maps = self.apart
+            holds = holds and all(figures["passed"].values())
+            figures["rollouts"] = imagined_rollouts(codec, self.columns, np.random.default_rng(self.seed), maps=maps)
+            self.held_out_figures = figures
+        limit = self.config.time_limit or math.inf
+        self.finished = holds or self.epoch >= self.config.epochs or elapsed >= 0.95 * limit
         self.model.train()
-        shown = ("views_exact", "cells", "distinct_codes", "distinct_views")
-        return {"stage": "network", **totals, **{name: figures[name] for name in shown}}
+        return {"stage": "network", **{name: float(value) for name, value in totals.items()}, **figures}
 
-    def _loss(self, source: np.ndarray, actions: np.ndarray, target: np.ndarray) -> dict[str, Tensor]:
-        model = self.model
-        action = torch.as_tensor(actions, device=self.device)
-        batch = self.views[torch.as_tensor(np.concatenate([source, target]), device=self.device)]
-        logits = model.encode(batch)
+    def _loss(self, rows: np.ndarray) -> dict[str, Tensor]:
+        """The parts of the loss on the steps `rows`."""
+        model, columns = self.model, self.columns
+        action = torch.as_tensor(columns.action[rows].astype(np.int64), device=self.device)
+        # A view is met many times in a batch: each distinct one goes through the encoder once, each meeting draws
+        # its own sample. Sums and gradients are the same.
+        views, place = np.unique(np.concatenate([columns.source[rows], columns.target[rows]]), return_inverse=True)
+        met = torch.as_tensor(place, device=self.device)
+        distinct = self.views[torch.as_tensor(views, device=self.device)]
+        logits = model.encode(distinct)[met]
         noisy = logits + losses.gumbel(logits.shape, self.generator, self.device)
         sample = torch.softmax(noisy / self.config.temperature, -1)
-        belief = torch.softmax(logits, -1)
         before, after = sample.chunk(2)
         predicted = model.transition(before, action)
+        observed = torch.softmax(logits, -1)[len(rows) :]
         embedding = model.actions(action).detach()
         parts = {
-            "reconstruction": losses.reconstruction(model.decode(sample), batch, self.weights),
+            "reconstruction": losses.reconstruction(model.decode(sample), distinct[met], self.weights),
             "kl": losses.kl_to_uniform(logits),
-            "forward": losses.kl_to_target(predicted, belief[len(source) :]),
+            "forward": losses.kl_to_target(predicted, observed),
             "inverse": F.mse_loss(model.inferred_embedding(before, after), embedding),
         }
         parts["loss"] = (

@@ -23,7 +23,8 @@ from nesy.experience import Experience
 from nesy.progress import SILENT, Progress
 from nesy.run_folder import write_json
 from nesy.world_model.codec import SymbolicCodec
-from nesy.world_model.distinct import Transitions, reference_transitions, transitions_of, with_mirror
+from nesy.world_model.columns import Columns
+from nesy.world_model.distinct import Transitions, reference_transitions, with_mirror
 from nesy.world_model.gates import evaluate
 from nesy.world_model.imagination import imagined_rollouts
 from nesy.world_model.logs import MetricsLog
@@ -34,12 +35,12 @@ from nesy.world_model.symbolic_training import SymbolicTrainer
 
 CHECKPOINT = "checkpoint.safetensors"
 Trainer = SymbolicTrainer | PaperTrainer
-TRAINERS: dict[str, type[SymbolicTrainer] | type[PaperTrainer]] = {"symbolic": SymbolicTrainer, "paper": PaperTrainer}
+ARCHITECTURES = ("symbolic", "paper")
 SHOWN = ("loss", "views_exact", "next_code_nll", "code_agreement")
 
 
 def train(
-    experience: Experience,
+    experience: Experience | Path,
     config: TrainConfig,
     folder: Path | str,
     seed: int = 0,
@@ -51,7 +52,7 @@ def train(
     """Train a world model, or go on where an interrupted training stopped.
 
     Args:
-        experience: what to learn from.
+        experience: what to learn from: in memory, or a folder, whose steps are then mapped (see `columns`).
         config: how to learn.
         folder: where model, checkpoint and logs go.
         seed: of everything random.
@@ -71,17 +72,18 @@ def train(
         UserError: impossible settings, or no experience.
     """
     folder = Path(folder)
-    _check(config, experience)
+    _check(config)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # small networks: one thread is as fast, and sums are in the same order everywhere
     try:
-        return _train(experience, config, folder, seed, progress, domain, variant)
+        columns = Columns.of(experience) if isinstance(experience, Experience) else Columns.mapped(experience, folder)
+        return _train(columns, config, folder, seed, progress, domain, variant)
     finally:
         torch.set_num_threads(threads)
 
 
 def _train(
-    experience: Experience,
+    columns: Columns,
     config: TrainConfig,
     folder: Path,
     seed: int,
@@ -91,14 +93,17 @@ def _train(
 ) -> dict[str, Any]:
     references = {} if domain is None else _references(domain, variant)
     known = [reference.views for reference in references.values()]
-    everything = with_mirror(transitions_of(experience, views=np.concatenate(known) if known else None))
-    training, held_out = everything, None
-    if config.held_out > 0:
-        apart = experience.held_out_maps(config.held_out, np.random.default_rng(seed))
-        if apart.any() and not apart.all():
-            training = with_mirror(transitions_of(experience.select(~apart)), views=everything.views)
-            held_out = transitions_of(experience.select(apart))
-    trainer: Trainer = TRAINERS[config.architecture](config, seed, everything, training, held_out)
+    everything = with_mirror(columns.transitions(views=np.concatenate(known) if known else None))
+    apart = columns.held_out(config.held_out, np.random.default_rng(seed))
+    held_out = columns.transitions(apart) if apart.any() else None
+    trainer: Trainer
+    if config.architecture == "paper":
+        trainer = PaperTrainer(config, seed, everything, columns, apart, held_out)
+    else:
+        training = everything
+        if held_out is not None:
+            training = with_mirror(columns.transitions(~apart), views=everything.views)
+        trainer = SymbolicTrainer(config, seed, everything, training, held_out)
     fingerprint = _fingerprint(config, seed, everything)
     tick, elapsed = _resume(trainer, folder / CHECKPOINT, fingerprint)
     with MetricsLog(folder, keep=tick) as log, progress.task("training the world model", trainer.length()) as bar:
@@ -119,7 +124,7 @@ def _train(
         **evaluate(codec, references.get("crossing", everything), everything.views),
         **({"following": evaluate(codec, references["following"])} if references else {}),
         "held_out": trainer.held_out_figures,
-        "rollouts": imagined_rollouts(codec, experience, np.random.default_rng(seed)),
+        "rollouts": imagined_rollouts(codec, columns, np.random.default_rng(seed)),
         "architecture": config.architecture,
         "epochs": tick,
         "seconds": round(elapsed, 2),
@@ -139,11 +144,9 @@ def _references(domain: Domain, variant: str) -> dict[str, Transitions]:
     return {task: transitions for task, transitions in found.items() if transitions is not None}
 
 
-def _check(config: TrainConfig, experience: Experience) -> None:
-    if config.architecture not in TRAINERS:
-        raise UserError(f"unknown architecture '{config.architecture}'; known: {', '.join(TRAINERS)}")
-    if not len(experience):
-        raise UserError("no experience to train on; collect some with: nesy collect")
+def _check(config: TrainConfig) -> None:
+    if config.architecture not in ARCHITECTURES:
+        raise UserError(f"unknown architecture '{config.architecture}'; known: {', '.join(ARCHITECTURES)}")
     positive = {"epochs": config.epochs, "batch_size": config.batch_size, "learning_rate": config.learning_rate}
     for name, value in positive.items():
         if not value > 0:
