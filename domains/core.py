@@ -21,6 +21,9 @@ from typing import Any, Literal, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from domains.recording import RecordedSteps as RecordedSteps
+from domains.recording import StepRecorder as StepRecorder
+
 EMPTY, WALL, GOAL, UNSEEN = 0, 1, 2, 3
 """Cell kinds of a view; a grid has only the first three."""
 CELL_KINDS = ("empty", "wall", "goal", "unseen")
@@ -195,18 +198,23 @@ class PredicateVocabulary(Protocol):
 
 
 class OraclePolicy(Protocol):
-    """A policy that may look at the full state of a batched environment."""
+    """An oracle's policy, asked through a batched environment.
+
+    One of the full state looks at the present state alone. One under partial observability looks only at what the
+    robot sees, and remembers it: ask it at every step of an episode, from the first on.
+    """
 
     def actions(self, env: BatchedEnvironment) -> NDArray[np.int64]:
-        """`[B]`: the policy's action in each environment's present state."""
+        """`[B]`: the policy's action in each environment's present situation."""
         ...
 
 
 @dataclass(frozen=True)
 class OracleResult:
-    """An exact optimum over a finite set of maps.
+    """An exact optimum over a finite set of worlds (maps, and persons' goals), `W` of them.
 
-    `value` is discounted, `mean_return` is not; both are averages over maps with `weights`.
+    `value` is discounted, `mean_return` is not; both are averages over worlds with `weights`. The arrays by map
+    have one entry per world, `[W]`, the goals of a map side by side.
     """
 
     value: float
@@ -281,7 +289,51 @@ class Domain(Protocol):
         ...
 
     def optimum(self, variant: str = "paper", discount: float = 0.9, **parameters: Any) -> OracleResult:
-        """The exact full-state optimum over the maps of `maps(variant, **parameters)`."""
+        """The exact full-state optimum over the maps of `maps(variant, **parameters)`.
+
+        Raises:
+            DomainError: there is no exact optimum, or too many maps for it.
+        """
+        ...
+
+    def bayes_optimum(self, variant: str = "paper", discount: float = 0.9, **parameters: Any) -> OracleResult:
+        """The exact optimum of an agent that knows the set of worlds, and sees only its observations.
+
+        Raises:
+            DomainError: there is none, or the set of worlds is infinite or too large.
+        """
+        ...
+
+    def egocentric_optimum(self, variant: str = "paper", discount: float = 0.9, **parameters: Any) -> OracleResult:
+        """What the Bayes optimum becomes when the agent takes the person to know what is really so.
+
+        The same information and the same planning, with a model of the person in which nobody is ever mistaken;
+        played in the true task.
+
+        Raises:
+            DomainError: there is none, or the set of worlds is infinite or too large.
+        """
+        ...
+
+    def episode_metrics(
+        self, steps: RecordedSteps, variant: str = "paper", **parameters: Any
+    ) -> dict[str, NDArray[Any]]:
+        """Every metric of every finished episode among recorded steps.
+
+        Returns:
+            Arrays `[E]`, one entry per finished episode, ordered by environment and then in time: `environment`,
+            `episode` (0 for the first of its environment), every metric by name, and every name of `steps.extra`.
+        """
+        ...
+
+    def belief_metrics(
+        self,
+        beliefs: NDArray[np.floating[Any]],
+        true_codes: NDArray[np.integer[Any]],
+        decoded_views: NDArray[np.uint8] | None = None,
+        true_views: NDArray[np.uint8] | None = None,
+    ) -> dict[str, NDArray[np.float64]]:
+        """How well beliefs `[B, N, K]` about the person's view match its true code `[B, N]`: arrays `[B]`."""
         ...
 
 

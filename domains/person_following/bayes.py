@@ -6,31 +6,32 @@ Every belief met keeps an upper and a lower bound on V. The upper bound starts a
 (nobody without the full state does better), the lower one as a value that nothing undercuts. Trials walk down
 by the best upper bound and the widest gap, and back up both: heuristic search value iteration (Smith and
 Simmons 2004) on an explicit graph of beliefs. A belief of one particle is solved at once. When the bounds of
-the root meet, to `tolerance`, the optimum is known; where time runs out first, both bounds are reported.
+the root meet, to `tolerance`, the optimum is known; where the graph grows too large first, both bounds are reported.
 """
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from domains.person_following.beliefs import KEPT_STEPS, Belief, Successor, Worlds
+from domains.core import DomainError
+from domains.person_following.beliefs import KEPT_STEPS, Belief, Gains, Successor, Worlds
 
 NUM_ACTIONS = 4
 _LEAST = -60.0
 
 
+MAX_BELIEFS = 200_000
+
+
 @dataclass(frozen=True)
 class BayesResult:
-    """Bounds on the discounted optimum, and what the best policy found earns without discount."""
+    """Bounds on the discounted optimum, and what the best policy found earns in every world."""
 
     lower: float
     upper: float
-    mean_return: float
-    success: float
-    seconds: float
+    gains: Gains
     beliefs: int
     trials: int
 
@@ -52,11 +53,14 @@ class _Node:
 class BayesSearch:
     """Heuristic search over the beliefs of some worlds."""
 
-    def __init__(self, worlds: Worlds, tolerance: float = 0.01) -> None:
+    def __init__(self, worlds: Worlds, tolerance: float = 0.01, max_beliefs: int = MAX_BELIEFS) -> None:
         """Put the beliefs after the first observation at the root."""
-        self.worlds, self.tolerance = worlds, tolerance
+        self.worlds, self.tolerance, self.max_beliefs = worlds, tolerance, max_beliefs
         self._nodes: dict[bytes, _Node] = {}
-        self.roots = [(share, self._node(belief)) for share, belief in worlds.start()]
+        start = worlds.start()
+        self.roots = [
+            (share, self._node(belief)) for share, belief in zip(start.probabilities, start.beliefs, strict=True)
+        ]
         self.trials = 0
 
     def bounds(self) -> tuple[float, float]:
@@ -64,23 +68,53 @@ class BayesSearch:
         lower = sum(share * node.lower for share, node in self.roots)
         return lower, sum(share * node.upper for share, node in self.roots)
 
-    def run(self, time_limit: float) -> BayesResult:
-        """Search until the bounds meet or the seconds are used up, then evaluate the policy found."""
-        started = time.monotonic()
-        while time.monotonic() - started < time_limit:
+    def run(self) -> BayesResult:
+        """Search until the bounds meet or the graph is full, then evaluate the policy found."""
+        while len(self._nodes) < self.max_beliefs:
             share, node = max(self.roots, key=lambda root: root[0] * (root[1].upper - root[1].lower))
             if share * (node.upper - node.lower) * len(self.roots) < self.tolerance:
                 break
-            self._trial(node, self.tolerance)
-            self.trials += 1
-        mean_return = success = 0.0
-        for share, node in self.roots:
-            total, won = self._evaluate(node)
-            mean_return += share * total
-            success += share * won
+            self._trial(node)
+        gains = Gains(*(np.zeros(len(self.worlds.chains)) for _ in range(3)))
+        stack = [(share, node.belief) for share, node in self.roots]
+        while stack:
+            share, belief = stack.pop()
+            successor = self.worlds.step(belief, self.action(belief), gains, share)
+            later = zip(successor.probabilities, successor.beliefs, strict=True)
+            stack.extend((share * probability, after) for probability, after in later)
         lower, upper = self.bounds()
-        seconds = time.monotonic() - started
-        return BayesResult(lower, upper, mean_return, success, seconds, len(self._nodes), self.trials)
+        return BayesResult(lower, upper, gains, len(self._nodes), self.trials)
+
+    def action(self, belief: Belief) -> int:
+        """The best action in a belief, which is solved first where no search has come by yet.
+
+        Raises:
+            DomainError: the graph of beliefs is full.
+        """
+        node = self._node(belief)
+        self._expand(node)
+        lower = [self._q(node, a, "lower") for a in range(NUM_ACTIONS)]
+        if max(lower) <= _LEAST / 2:
+            self._solve(node)
+            lower = [self._q(node, a, "lower") for a in range(NUM_ACTIONS)]
+        return int(np.argmax(lower))
+
+    def solve(self, belief: Belief) -> int:
+        """The best action in a belief that is solved for its own sake, whatever the search at the root has left open.
+
+        Raises:
+            DomainError: the graph of beliefs is full.
+        """
+        node = self._node(belief)
+        self._expand(node)
+        self._solve(node)
+        return self.action(belief)
+
+    def _solve(self, node: _Node) -> None:
+        while node.upper - node.lower > self.tolerance:
+            if len(self._nodes) >= self.max_beliefs:
+                raise DomainError(f"the search over beliefs did not close within {self.max_beliefs} of them")
+            self._trial(node)
 
     def _node(self, belief: Belief) -> _Node:
         key = belief.key()
@@ -107,42 +141,19 @@ class BayesSearch:
         )
         return successor.reward + self.worlds.discount * later
 
-    def _trial(self, root: _Node, tolerance: float) -> None:
-        path, node = [], root
-        discount = self.worlds.discount
+    def _trial(self, root: _Node) -> None:
+        path, node, tolerance = [], root, self.tolerance
+        self.trials += 1
         while node.upper - node.lower > tolerance:
             self._expand(node)
             path.append(node)
             action = max(range(NUM_ACTIONS), key=lambda a, n=node: self._q(n, a, "upper"))  # type: ignore[misc]
             pairs = zip(node.successors[action].probabilities, node.children[action], strict=True)
             gaps = [(share * (child.upper - child.lower), k) for k, (share, child) in enumerate(pairs)]
-            tolerance /= discount
+            tolerance /= max(self.worlds.discount, 1e-6)
             if not gaps or max(gaps)[0] <= 0:
                 break
             node = node.children[action][max(gaps)[1]]
         for node in reversed(path):
             node.upper = min(node.upper, max(self._q(node, a, "upper") for a in range(NUM_ACTIONS)))
             node.lower = max(node.lower, max(self._q(node, a, "lower") for a in range(NUM_ACTIONS)))
-
-    def _evaluate(self, root: _Node) -> tuple[float, float]:
-        """Undiscounted return and success of the policy that takes the best lower bound."""
-        total = success = 0.0
-        stack = [(1.0, root)]
-        while stack:
-            share, node = stack.pop()
-            if not node.successors and len(node.belief.weights) == 1:
-                state = node.belief.particles[0].tolist()
-                action = int(self.worlds.policies[state[0]][(node.belief.t, *state[1:])])
-                successor = self.worlds.step(node.belief, action)
-                children = [_Node(belief, 0.0, 0.0) for belief in successor.beliefs]
-            else:
-                self._expand(node)
-                best = [self._q(node, a, "lower") for a in range(NUM_ACTIONS)]
-                if max(best) <= _LEAST / 2:
-                    best = [self._q(node, a, "upper") for a in range(NUM_ACTIONS)]
-                action = int(np.argmax(best))
-                successor, children = node.successors[action], node.children[action]
-            total += share * successor.reward
-            success += share * successor.success
-            stack.extend((share * p, child) for p, child in zip(successor.probabilities, children, strict=True))
-        return total, success

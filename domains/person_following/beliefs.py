@@ -22,6 +22,8 @@ from domains.person_following.person_chain import PersonChain, pose_views
 from domains.person_following.variants import Parameters
 
 KEPT_STEPS = 90
+_LABELS_OF_VIEW = 4096  # more than there are configurations
+_UNKNOWN = 110.0  # more than any episode can still bring after KEPT_STEPS
 WORLD, PERSON, WAIT, POSE, STOOD, LOST_COUNT = range(6)
 
 
@@ -38,12 +40,31 @@ class Belief(NamedTuple):
 
 
 class Successor(NamedTuple):
-    """What an action brings: expected reward, and the beliefs that may follow, with probabilities."""
+    """What an action brings: expected reward, and the beliefs that may follow, by what the robot then sees."""
 
     reward: float
     probabilities: list[float]
+    labels: list[int]
     beliefs: list[Belief]
     success: float
+
+
+class Gains(NamedTuple):
+    """What a policy earns in each of W worlds, gathered step by step."""
+
+    value: NDArray[np.float64]  # [W]: discounted
+    total: NDArray[np.float64]  # [W]: not discounted
+    success: NDArray[np.float64]  # [W]
+
+
+class Solved(NamedTuple):
+    """The full-state optimum of one world."""
+
+    value: float
+    total: float
+    success: float
+    row: NDArray[np.int32]  # [K, P]: row of `kept` for a step and a person state, -1 where it cannot be
+    kept: NDArray[np.float32]  # [rows, W, C, G, L]: values of the first K steps
 
 
 class Worlds:
@@ -77,35 +98,51 @@ class Worlds:
         self.moved_at = np.array([chain.moved_at for chain in chains])
         views = np.concatenate([pose_views(chain, parameters) for chain in chains], axis=1)
         flat = views.reshape(-1, parameters.view_size**2)
-        _, number = np.unique(flat, axis=0, return_inverse=True)
+        distinct, number = np.unique(flat, axis=0, return_inverse=True)
+        self._number_of_view = {view.tobytes(): k for k, view in enumerate(distinct)}
         self.view_number = number.reshape(views.shape[:2])
-        self.values, self.policies = [], []
-        for chain in chains:
-            kept = np.empty((KEPT_STEPS, *state_shape(chain, parameters)), np.float32)
-            policy, *_ = sweep(chain, parameters, discount, kept)
-            self.values.append(kept)
-            self.policies.append(policy)
+        self.solved = [self._solve(chain) for chain in chains]
 
-    def start(self) -> list[tuple[float, Belief]]:
-        """The beliefs after the first observation, with their probabilities."""
+    def _solve(self, chain: PersonChain) -> Solved:
+        steps = min(KEPT_STEPS, self.parameters.max_steps)
+        kept = np.empty((steps, *state_shape(chain, self.parameters)), np.float32)
+        reached = np.zeros((self.parameters.max_steps, *kept.shape[1:3]), np.bool_)
+        _, *tables = sweep(chain, self.parameters, self.discount, kept, reached)
+        start = chain.pose_index[1, 1, 0]
+        value, total, success = (float(table[0, 0, 0, start, 0, 0]) for table in tables)
+        there = reached[:steps].any(axis=2)
+        row = np.full(there.shape, -1, np.int32)
+        row[there] = np.arange(there.sum())
+        return Solved(value, total, success, row, kept[there])
+
+    def label(self, view: NDArray[np.uint8], configuration: int) -> int:
+        """The number of an observation; -1 where no world shows such a view."""
+        number = self._number_of_view.get(view.tobytes(), -1)
+        return -1 if number < 0 else number * _LABELS_OF_VIEW + int(configuration)
+
+    def start(self, waiting: int = 0) -> Successor:
+        """The beliefs after the first observation."""
         count = len(self.chains)
         particles = np.zeros((count, 6), np.int32)
         particles[:, WORLD] = np.arange(count)
         particles[:, POSE] = [chain.pose_index[1, 1, 0] for chain in self.chains]
-        return self._split(0, particles, self.weights.astype(np.float64))
+        particles[:, WAIT] = waiting
+        parts = self._split(0, particles, self.weights.astype(np.float64))
+        return _successor(0.0, parts, 0.0)
 
     def value(self, belief: Belief) -> float:
         """Expected full-state value: an upper bound on what is possible without the full state."""
         if belief.t >= KEPT_STEPS:
-            return 110.0
+            return _UNKNOWN
         total = 0.0
         for particle, weight in zip(belief.particles.tolist(), belief.weights.tolist(), strict=True):
-            i, *state = particle
-            total += weight * float(self.values[i][(belief.t, *state)])
+            i, p, w, c, g, lost = particle
+            solved = self.solved[i]
+            total += weight * float(solved.kept[solved.row[belief.t, p], w, c, g, lost])
         return total
 
-    def step(self, belief: Belief, action: int) -> Successor:
-        """The exact consequences of an action."""
+    def step(self, belief: Belief, action: int, gains: Gains | None = None, share: float = 1.0) -> Successor:
+        """The exact consequences of an action; `gains`, if given, gets them by world, times `share`."""
         rules = self.parameters
         time = belief.t + 1
         particles, weights = belief.particles, belief.weights
@@ -130,9 +167,9 @@ class Worlds:
         both = np.nonzero(first != second)[0]
         index = np.concatenate([np.arange(len(i)), both])
         after = np.concatenate([first, second[both]])
-        share = weights[index].copy()
-        share[both] *= 0.5
-        share[len(i) :] *= 0.5
+        weight = weights[index].copy()
+        weight[both] *= 0.5
+        weight[len(i) :] *= 0.5
         i, to, waiting, entered = i[index], to[index], waiting[index], entered[index]
         place = self.table_base[i] + after * self.num_poses[i] + to
         reward = self.reward[place] + (self.bump[place] if action == FORWARD else 0.0)
@@ -146,10 +183,16 @@ class Worlds:
         ended |= time >= rules.max_steps
         goes_on = ~ended
         following = np.stack([i, after, waiting, to, stood, lost], axis=1).astype(np.int32)[goes_on]
-        parts = self._split(time, following, share[goes_on])
-        return Successor(float(share @ reward), [part for part, _ in parts], [b for _, b in parts], float(share @ won))
+        if gains is not None:
+            np.add.at(gains.value, i, share * weight * reward * self.discount**belief.t)
+            np.add.at(gains.total, i, share * weight * reward)
+            np.add.at(gains.success, i, share * weight * won)
+        parts = self._split(time, following, weight[goes_on])
+        return _successor(float(weight @ reward), parts, float(weight @ won))
 
-    def _split(self, t: int, particles: NDArray[np.int32], weights: NDArray[np.float64]) -> list[tuple[float, Belief]]:
+    def _split(
+        self, t: int, particles: NDArray[np.int32], weights: NDArray[np.float64]
+    ) -> list[tuple[float, int, Belief]]:
         """Particles by what the robot observes in them, equal ones merged; probabilities are not normalised."""
         if len(particles) == 0:
             return []
@@ -157,11 +200,11 @@ class Worlds:
         moved = (t >= self.moved_at[i]).astype(np.int64)
         seen = self.view_number[moved, self.pose_base[i] + c]
         configuration = self.configuration[self.table_base[i] + p * self.num_poses[i] + c]
-        label = seen * 4096 + configuration
+        label = seen * _LABELS_OF_VIEW + configuration
         order = np.lexsort((*particles.T[::-1], label))
         particles, weights, label = particles[order], weights[order], label[order]
         bounds = np.concatenate([[0], np.nonzero(np.diff(label))[0] + 1, [len(label)]])
-        parts = []
+        parts: list[tuple[float, int, Belief]] = []
         for low, high in pairwise(bounds.tolist()):
             some, share = particles[low:high], weights[low:high]
             if high - low > 1:
@@ -170,5 +213,11 @@ class Worlds:
                     share = np.add.reduceat(share, np.nonzero(new)[0])
                     some = some[new]
             total = float(share.sum())
-            parts.append((total, Belief(t, np.ascontiguousarray(some), share / total)))
+            parts.append((total, int(label[low]), Belief(t, np.ascontiguousarray(some), share / total)))
         return parts
+
+
+def _successor(reward: float, parts: list[tuple[float, int, Belief]], success: float) -> Successor:
+    return Successor(
+        reward, [part[0] for part in parts], [part[1] for part in parts], [part[2] for part in parts], success
+    )

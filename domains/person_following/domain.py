@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from domains.core import DomainSpec, OracleResult, ViewGeometry
+from domains.core import DomainSpec, OracleResult, RecordedSteps, ViewGeometry
 from domains.person_following.enumeration import all_maps, all_transitions, all_views
+from domains.person_following.metrics import belief_metrics, episode_metrics
 from domains.person_following.predicates import ViewPredicates
-from domains.person_following.variants import VARIANTS, parameters_of
+from domains.person_following.variants import VARIANTS, Parameters, parameters_of
 from domains.person_following.vector_env import PersonFollowingVectorEnv
 
 
@@ -70,6 +71,33 @@ class PersonFollowing:
 
         grids, weights = _maps(variant, tuple(sorted(parameters.items())))
         return full_state_optimum(grids, weights, parameters_of(variant, **parameters), discount)
+
+    def bayes_optimum(self, variant: str = "paper", discount: float = 0.9, **parameters: Any) -> OracleResult:
+        """The exact optimum of an agent that knows the set of worlds, and sees only its observations."""
+        from domains.person_following.history_policies import bayes_optimum
+
+        return bayes_optimum(*self._worlds_of(variant, parameters), discount)
+
+    def egocentric_optimum(self, variant: str = "paper", discount: float = 0.9, **parameters: Any) -> OracleResult:
+        """The same for an agent in whose model of the person nobody is ever mistaken, played in the true task."""
+        from domains.person_following.history_policies import egocentric_optimum
+
+        return egocentric_optimum(*self._worlds_of(variant, parameters), discount)
+
+    @staticmethod
+    def _worlds_of(
+        variant: str, parameters: dict[str, Any]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float64], Parameters]:
+        rules = parameters_of(variant, **parameters)
+        return *_maps(variant, tuple(sorted(parameters.items()))), rules
+
+    @staticmethod
+    def episode_metrics(steps: RecordedSteps, variant: str = "paper", **parameters: Any) -> dict[str, NDArray[Any]]:
+        """Every metric of every finished episode; see `domains.core.Domain.episode_metrics`."""
+        rules = parameters_of(variant, **parameters)
+        return episode_metrics(steps, rules.follow_distance, rules.robot_rest)
+
+    belief_metrics = staticmethod(belief_metrics)
 
 
 @lru_cache(maxsize=16)

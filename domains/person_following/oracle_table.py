@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from domains.core import DomainError
 from domains.person_following.batch import Batch
-from domains.person_following.bayes import BayesSearch
+from domains.person_following.bayes import MAX_BELIEFS, BayesSearch
 from domains.person_following.beliefs import Worlds
 from domains.person_following.domain import DOMAIN
 from domains.person_following.experts import LastSeenFollower
+from domains.person_following.history_policies import egocentric_optimum
 from domains.person_following.person_chain import person_chains
 from domains.person_following.variants import Parameters, parameters_of
-from domains.person_following.wrong_models import egocentric_optimum
+from domains.person_following.wrong_models import egocentric_full_state
 
 Act = Callable[[Batch, dict[str, NDArray[Any]]], NDArray[np.int64]]
 
@@ -25,7 +25,7 @@ Act = Callable[[Batch, dict[str, NDArray[Any]]], NDArray[np.int64]]
 def oracle_row(
     variant: str,
     discount: float = 0.99,
-    bayes_seconds: float = 30.0,
+    max_beliefs: int = MAX_BELIEFS,
     num_maps: int | None = None,
     seed: int = 0,
     **changes: Any,
@@ -35,7 +35,7 @@ def oracle_row(
     Args:
         variant: name of the variant.
         discount: of the optima; returns are reported without discount.
-        bayes_seconds: time limit of the Bayes search.
+        max_beliefs: where the Bayes search stops, whether or not its bounds have met.
         num_maps: how many maps to draw from all, equally weighted; None for all of them.
         seed: of that draw.
         changes: parameters that differ from the variant's.
@@ -50,24 +50,25 @@ def oracle_row(
     shares = np.repeat(weights / parameters.num_goals, parameters.num_goals)
     worlds = Worlds(chains, shares, parameters, discount)
     row: dict[str, Any] = {"variant": variant, "changes": changes, "worlds": len(chains), "discount": discount}
-    row["full_state"] = _full_state(worlds, parameters) | {"seconds": time.monotonic() - started}
-    bayes = BayesSearch(worlds).run(bayes_seconds)
-    row["bayes"] = {
-        "return": bayes.mean_return,
-        "success": bayes.success,
+    alone = np.array([(solved.total, solved.success) for solved in worlds.solved])
+    row["full_state"] = _averages(alone[:, 0], alone[:, 1], shares, started)
+    started = time.monotonic()
+    bayes = BayesSearch(worlds, max_beliefs=max_beliefs).run()
+    # gains are weighted by the probability of their world already
+    row["bayes"] = _averages(bayes.gains.total, bayes.gains.success, np.ones(len(shares)), started) | {
         "lower": bayes.lower,
         "upper": bayes.upper,
         "solved": bayes.solved,
         "beliefs": bayes.beliefs,
-        "seconds": bayes.seconds,
     }
-    started = time.monotonic()
-    try:
-        result = egocentric_optimum(worlds)
-        row["egocentric"] = {"return": result.mean_return, "success": result.success}
-        row["egocentric"]["seconds"] = time.monotonic() - started
-    except DomainError:
-        row["egocentric"] = None
+    row["egocentric"] = row["egocentric_full_state"] = None
+    if parameters.goal_moves_at:
+        started = time.monotonic()
+        result = egocentric_optimum(grids, weights, parameters, discount)
+        row["egocentric"] = _averages(result.map_return, result.map_success, shares, started)
+        started = time.monotonic()
+        gains = egocentric_full_state(worlds)
+        row["egocentric_full_state"] = _averages(gains.total, gains.success, shares, started)
     own = np.tile(np.arange(parameters.num_goals), len(grids))
     worlds_grids = np.repeat(grids, parameters.num_goals, axis=0)
     row["greedy_follower"] = _follow(parameters, worlds_grids, own, shares, lambda batch, _: batch.expert("follower"))
@@ -78,34 +79,14 @@ def oracle_row(
     return row
 
 
-def _full_state(worlds: Worlds, parameters: Parameters) -> dict[str, float]:
-    """Undiscounted return and success of the full-state optimum, by following its policy."""
-    total = success = value = 0.0
-    for share, root in zip(worlds.weights, _alone(worlds), strict=True):
-        stack = [(share, root)]
-        value += share * worlds.value(root)
-        while stack:
-            weight, belief = stack.pop()
-            state = belief.particles[0].tolist()
-            action = int(worlds.policies[state[0]][(belief.t, *state[1:])])
-            successor = worlds.step(belief, action)
-            total += weight * successor.reward
-            success += weight * successor.success
-            for probability, after in zip(successor.probabilities, successor.beliefs, strict=True):
-                for k, part in enumerate(after.weights.tolist()):
-                    one = after._replace(particles=after.particles[k : k + 1], weights=np.ones(1))
-                    stack.append((weight * probability * part, one))
-    return {"value": value, "return": total, "success": success}
-
-
-def _alone(worlds: Worlds) -> list[Any]:
-    """The first belief of somebody who knows the world, for every world."""
-    beliefs = {}
-    for _, belief in worlds.start():
-        for k, particle in enumerate(belief.particles):
-            one = belief._replace(particles=belief.particles[k : k + 1], weights=np.ones(1))
-            beliefs[int(particle[0])] = one
-    return [beliefs[i] for i in range(len(worlds.chains))]
+def _averages(
+    returns: NDArray[np.float64], success: NDArray[np.float64], shares: NDArray[np.float64], started: float
+) -> dict[str, Any]:
+    return {
+        "return": float(returns @ shares),
+        "success": float(success @ shares),
+        "seconds": time.monotonic() - started,
+    }
 
 
 def _follow(

@@ -153,16 +153,22 @@ def full_state_optimum(
 
 
 def sweep(
-    chain: PersonChain, parameters: Parameters, discount: float, kept: NDArray[np.float32] | None = None
+    chain: PersonChain,
+    parameters: Parameters,
+    discount: float,
+    kept: NDArray[np.float32] | None = None,
+    reached: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.int8], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Policy [T, P, W, C, G, L], and tables of which [0] is t = 0: value, undiscounted return, success.
 
-    `kept` [K, P, W, C, G, L], if given, is filled with the values of the first K steps.
+    `kept` [K, P, W, C, G, L], if given, is filled with the values of the first K steps, and `reached` [T, P, W] with
+    where that is so.
     """
     shape = state_shape(chain, parameters)
     people, waits = shape[:2]
     rules = parameters.rules(following=True)
-    reached = np.zeros((parameters.max_steps, people, waits), np.bool_)
+    if reached is None:
+        reached = np.zeros((parameters.max_steps, people, waits), np.bool_)
     reachable_states(rules, chain.successors, reached)
     # Most of these entries are never touched, so they are reserved and not cleared.
     policy = np.empty((parameters.max_steps, *shape), np.int8)

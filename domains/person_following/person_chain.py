@@ -34,6 +34,7 @@ from domains.person_following.world import BELIEVED_X, BELIEVED_Y, GOAL_X, GOAL_
 
 PENDING_NONE, PENDING_LEFT, PENDING_RIGHT = 0, 1, 2
 NEVER = 1 << 30
+MAX_WORLDS = 2_000
 
 
 class PersonChain(NamedTuple):
@@ -59,8 +60,14 @@ def person_chains(grids: NDArray[np.uint8], parameters: Parameters) -> list[Pers
     """The chains of all worlds on raw maps [M, size, size]: for each map, one for each candidate goal.
 
     Raises:
-        DomainError: rules under which the person is not such a chain.
+        DomainError: rules under which the person is not such a chain, or too many worlds to go through.
     """
+    count = len(grids) * parameters.num_goals
+    if count > MAX_WORLDS:
+        raise DomainError(
+            f"{count:,} worlds (size {parameters.size}, {parameters.num_crossings} crossings) are too many for an "
+            f"exact optimum, at most {MAX_WORLDS:,}: take a smaller instance, such as size=9, num_crossings=1 (42 maps)"
+        )
     if parameters.num_persons > 1:
         raise DomainError("oracles need num_persons = 1: the others walk at random")
     if parameters.goal_moves_at and (parameters.look_back or parameters.person_rest):
