@@ -29,6 +29,7 @@ class Situation(NamedTuple):
         percepts: what perception makes of it; None for agents that do without.
         active: bool [B], where the episode still goes on; actions elsewhere are ignored.
         last_actions: int64 [B], what was done before; None at the start of the episodes.
+        allowed: bool [B, A], what the rules allow, at least one action each; None without rules.
     """
 
     env: BatchedEnvironment
@@ -36,6 +37,7 @@ class Situation(NamedTuple):
     percepts: Percepts | None
     active: np.ndarray
     last_actions: np.ndarray | None
+    allowed: np.ndarray | None = None
 
 
 class Agent(Protocol):
@@ -55,7 +57,7 @@ class DQNAgent:
     def actions(self, situation: Situation) -> np.ndarray:
         """Greedy actions."""
         assert situation.percepts is not None
-        return self.policy.actions(situation.percepts)
+        return self.policy.actions(situation.percepts, situation.allowed)
 
 
 class Planner(Protocol):

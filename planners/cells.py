@@ -1,9 +1,10 @@
-"""Building the agent of one cell of the comparison from a run folder; training it first, if it learns."""
+"""Building the player of one cell of the comparison from a run folder; training it first, if it learns."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -14,63 +15,86 @@ from planners import config as settings
 from planners.agents import Agent, DQNAgent, PlanningAgent
 from planners.baselines import LastSeenFollower, OptimalAgent, OracleFollower, RandomAgent
 from planners.config import CompareConfig
-from planners.evaluation import Columns
-from planners.perception import Perception
+from planners.evaluation import Columns, Player
+from planners.perception import Codec, Perception
 
 if TYPE_CHECKING:
     from planners.compare import Cell
+    from planners.shielding import ActionMask
 
 
-def build_agent(
+class Built(NamedTuple):
+    """What a cell needs to be evaluated.
+
+    Attributes:
+        player: acts.
+        training: the training episodes, if it learns.
+        experience_steps: environment steps that it learned from, besides those of the world model.
+    """
+
+    player: Player
+    training: Columns | None
+    experience_steps: int
+
+
+def build_player(
     cell: Cell,
     run: RunFolder,
     domain: Domain,
     config: CompareConfig,
     seed: int,
-    progress: Progress,
-    advance: Callable[[int], None],
-) -> tuple[Agent, Perception | None, Columns | None]:
-    """The cell's agent, its perception (if it needs one), and its training episodes (if it learns)."""
+    progress: Progress = SILENT,
+    checkpoint: Path | None = None,
+) -> Built:
+    """The cell's player; a learner is trained, from `checkpoint` on where that file is."""
     own_seed = cell_seed(cell, seed)
     if cell.agent in settings.REFERENCE_AGENTS:
-        return _reference(cell, domain, own_seed), None, None
-    from nesy.world_model import SymbolicCodec, load_world_model
-
-    codec = SymbolicCodec(load_world_model(run.world_model))
-    perception = Perception(codec, cell.influence, np.random.default_rng([own_seed, 1]))
+        agent = _reference(cell, domain, own_seed)
+        if not config.rules:
+            return Built(Player(agent), None, 0)
+        codec = _codec(run)  # only to tell in which situation a rule applies
+        return Built(Player(agent, None, action_mask(config, codec, domain), codec), None, 0)
+    codec = _codec(run)
+    mask = action_mask(config, codec, domain)
     if cell.agent in settings.PLANNING_AGENTS:
-        from planners.ialm import IALM
-
-        model = IALM.load(run.ialm)
-        return PlanningAgent(cell.agent, model, config.search, domain.spec.geometry, own_seed), perception, None
+        perception = Perception(codec, cell.influence, np.random.default_rng([own_seed, 1]))
+        return Built(
+            Player(_planner(cell, run, domain, config, own_seed), perception, mask), None, _practised(cell, run)
+        )
+    if cell.policy:
+        return _stored(cell, Path(cell.policy), codec, mask, own_seed)
     from planners.dqn import train
 
     # Learning starts from the same weights and explores alike under every influence mode: only b~ differs.
     learning_seed = int(np.random.SeedSequence([seed, cell.seed]).generate_state(1)[0])
     policy, training = train(
-        domain, codec, cell.inputs, cell.influence, cell.variant, config.dqn, learning_seed, progress
+        domain, codec, cell.inputs, cell.influence, cell.variant, config.dqn, learning_seed, progress, mask, checkpoint
     )
-    policy.save(run.policies / f"{cell.name}.safetensors")
-    return DQNAgent(policy), perception, training
+    path = run.policies / f"{cell.name}.safetensors"
+    policy.save(path)
+    return _stored(cell, path, codec, mask, own_seed)._replace(training=training)
 
 
-def restored_agent(
-    cell: Cell, run: RunFolder, domain: Domain, config: CompareConfig, seed: int
-) -> tuple[Agent, Perception | None]:
-    """The agent of a finished cell as it was when it was evaluated: a learner with its stored policy.
+def restored_player(cell: Cell, run: RunFolder, domain: Domain, config: CompareConfig, seed: int) -> Player:
+    """The player of a finished cell as it was when it was evaluated: a learner with its stored policy.
 
     Raises:
         UserError: the policy is missing or damaged.
     """
-    if cell.agent not in settings.LEARNING_AGENTS:
-        agent, perception, _ = build_agent(cell, run, domain, config, seed, SILENT, lambda count: None)
-        return agent, perception
-    from nesy.world_model import SymbolicCodec, load_world_model
-    from planners.dqn import DQNPolicy
+    if cell.agent in (*settings.REFERENCE_AGENTS, *settings.PLANNING_AGENTS):
+        return build_player(cell, run, domain, config, seed).player
+    codec = _codec(run)
+    path = Path(cell.policy) if cell.policy else run.policies / f"{cell.name}.safetensors"
+    return _stored(cell, path, codec, action_mask(config, codec, domain), cell_seed(cell, seed)).player
 
-    codec = SymbolicCodec(load_world_model(run.world_model))
-    perception = Perception(codec, cell.influence, np.random.default_rng([cell_seed(cell, seed), 1]))
-    return DQNAgent(DQNPolicy.load(run.policies / f"{cell.name}.safetensors")), perception
+
+def action_mask(config: CompareConfig, codec: Codec, domain: Domain) -> ActionMask | None:
+    """The rules of the comparison as a mask over actions; None where there are none."""
+    if not config.rules:
+        return None
+    from planners.shielding import ShieldMask
+
+    return ShieldMask([Path(rule) for rule in config.rules], codec, domain)
 
 
 def cell_seed(cell: Cell, seed: int) -> int:
@@ -78,11 +102,51 @@ def cell_seed(cell: Cell, seed: int) -> int:
     return int(np.random.SeedSequence([seed, cell.seed, *cell.name.encode()]).generate_state(1)[0])
 
 
+def _codec(run: RunFolder) -> Codec:
+    from nesy.world_model import SymbolicCodec, load_world_model
+
+    return SymbolicCodec(load_world_model(run.world_model))
+
+
+def _stored(cell: Cell, path: Path, codec: Codec, mask: ActionMask | None, own_seed: int) -> Built:
+    """A trained policy from its file, perceiving as it did when it was trained."""
+    from planners.dqn import DQNPolicy
+    from planners.published import dqn_perception
+
+    policy = DQNPolicy.load(path)
+    perception = dqn_perception(codec, cell.influence, np.random.default_rng([own_seed, 1]), policy.config)
+    return Built(Player(DQNAgent(policy), perception, mask), None, int(policy.trained.get("steps", 0)))
+
+
+def _planner(cell: Cell, run: RunFolder, domain: Domain, config: CompareConfig, seed: int) -> Agent:
+    from planners.compare import ialm_folder
+    from planners.ialm import IALM
+
+    model = IALM.load(ialm_folder(run, cell.variant))
+    return PlanningAgent(cell.agent, model, config.search_of_cells, domain.spec.geometry, seed)
+
+
+def _practised(cell: Cell, run: RunFolder) -> int:
+    """Environment steps of the practice that the planner's model was learned from."""
+    import pyarrow.parquet as pq
+
+    from planners.compare import ialm_folder
+
+    shards = (ialm_folder(run, cell.variant) / "practice").glob("part-*.parquet")
+    return sum(pq.read_metadata(path).num_rows for path in shards)
+
+
 def _reference(cell: Cell, domain: Domain, seed: int) -> Agent:
-    if cell.agent == "random":
-        return RandomAgent(len(domain.spec.action_names), seed)
-    if cell.agent == "greedy-follower":
-        return OracleFollower()
-    if cell.agent == "greedy-last-seen":
-        return LastSeenFollower(domain.spec.geometry)
-    return OptimalAgent(domain.optimum(cell.variant).policy)
+    simple: dict[str, Callable[[], Agent]] = {
+        "random": lambda: RandomAgent(len(domain.spec.action_names), seed),
+        "greedy-follower": OracleFollower,
+        "greedy-last-seen": lambda: LastSeenFollower(domain.spec.geometry),
+    }
+    if cell.agent in simple:
+        return simple[cell.agent]()
+    oracles = {
+        "optimum": domain.optimum,
+        "bayes-optimum": domain.bayes_optimum,
+        "egocentric-optimum": domain.egocentric_optimum,
+    }
+    return OptimalAgent(oracles[cell.agent](cell.variant).policy)

@@ -1,8 +1,8 @@
 """The comparison: a grid of cells (agent, inputs, influence, variant, seed), each run once and kept.
 
 Every cell is a pure function of the run folder, the settings and its seeds, and leaves one Parquet file under
-results/cells/. A stopped comparison goes on with the cells that are missing; the number of processes changes
-nothing but the timing columns.
+results/cells/. A stopped comparison goes on with the cells that are missing, a stopped training from its last
+checkpoint; where and how many at a time they run changes nothing but the timing columns.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +19,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from domains.core import Domain, DomainError, load_domain
+from domains.core import Domain, load_domain
 from nesy.errors import UserError
 from nesy.progress import SILENT, Progress
-from nesy.run_folder import RunFolder, atomic_path, read_json, write_json
+from nesy.run_folder import RunFolder, atomic_path, read_json
 from planners import config as settings
 from planners.config import CompareConfig, SearchConfig
 from planners.evaluation import Columns, evaluate, outcome_names
-from planners.statistics import Interval, bootstrap
 
 EVALUATION_SEED = 20_250_420
 """Seed of all evaluation episodes, whatever the seed of the run: results of different runs compare."""
@@ -34,27 +33,30 @@ EVALUATION_SEED = 20_250_420
 
 @dataclass(frozen=True)
 class Cell:
-    """One agent under one condition with one seed; `inputs` and `influence` are empty where they mean nothing."""
+    """One agent under one condition with one seed; `inputs` and `influence` are empty where they mean nothing.
+
+    `policy` is the file of an agent that was trained elsewhere.
+    """
 
     agent: str
     inputs: str
     influence: str
     variant: str
     seed: int
+    policy: str = ""
 
     @property
     def name(self) -> str:
         """File name of the cell's results."""
-        return "-".join(part for part in (self.agent, self.inputs, self.influence, self.variant) if part) + (
-            f"-seed{self.seed}"
-        )
+        parts = (part for part in (self.agent, self.inputs, self.influence, self.variant) if part)
+        return "-".join(parts) + f"-seed{self.seed}"
 
 
 def grid(config: CompareConfig) -> list[Cell]:
     """All cells, in the order of the table.
 
     Raises:
-        UserError: an unknown agent, input set or influence mode, or none at all.
+        UserError: an unknown agent, input set or influence mode, or none at all; a policy that cannot be read.
     """
     for name, chosen, known in (
         ("agent", config.agents, settings.AGENTS),
@@ -64,7 +66,9 @@ def grid(config: CompareConfig) -> list[Cell]:
         for item in chosen:
             if item not in known:
                 raise UserError(f"unknown {name} '{item}' (known: {', '.join(known)})")
-    for name, values in (("agents", config.agents), ("variants", config.variants), ("seeds", config.seeds)):
+    if not (config.agents or config.policies):
+        raise UserError("nothing to compare: the lists of agents and of policies are empty")
+    for name, values in (("variants", config.variants), ("seeds", config.seeds)):
         if not values:
             raise UserError(f"nothing to compare: the list of {name} is empty")
     if min(config.episodes, config.planner_episodes) < 1:
@@ -82,6 +86,11 @@ def grid(config: CompareConfig) -> list[Cell]:
                 for influence in influences
                 for seed in config.seeds
             ]
+        cells += [
+            Cell(f"file {Path(path).stem}", *_trained_with(path), variant, seed, str(Path(path).resolve()))
+            for path in config.policies
+            for seed in config.seeds
+        ]
     return cells
 
 
@@ -92,6 +101,8 @@ def compare(
     jobs: int = 1,
     progress: Progress = SILENT,
     domain_name: str = "person_following",
+    engine: str = "local",
+    address: str | None = None,
 ) -> list[dict[str, Any]]:
     """Run the cells that are missing and sum all of them up.
 
@@ -102,26 +113,31 @@ def compare(
         jobs: processes.
         progress: told of finished episodes, of the whole grid.
         domain_name: which domain.
+        engine: `local` for processes of this machine, `ray` for a cluster.
+        address: of the Ray cluster; None for one that Ray finds or starts on this machine.
 
     Returns:
         The `comparison` list of summary.json.
     """
     from planners.engines import run_cells
+    from planners.results import map_optimum, write_results
 
+    config = replace(config, rules=tuple(str(Path(rule).resolve()) for rule in config.rules))
     cells = grid(config)
     domain = load_domain(domain_name)
-    if any(cell.agent in settings.PLANNING_AGENTS for cell in cells):
-        ensure_ialm(run, domain, config.variants[0], config.search, seed, progress)
+    for variant in config.variants:
+        if any(cell.agent in settings.PLANNING_AGENTS for cell in cells):
+            ensure_ialm(run, domain, variant, config.search, seed, progress)
     missing = [cell for cell in cells if not _is_done(run, config, cell, seed)]
     total = sum(_episodes(config, cell) for cell in missing)
     with progress.task("compare", total) as task:
-        jobs_of = [(cell, run.path, config, seed, domain_name) for cell in missing]
-        run_cells(jobs_of, jobs, task)
-    tables = [pq.read_table(_path(run, cell)) for cell in cells]
+        run_cells([(cell, run.path, config, seed, domain_name) for cell in missing], jobs, task, engine, address)
+    tables = [pq.read_table(cell_path(run, cell)) for cell in cells]
+    whole = pa.concat_tables(tables, promote_options="default").replace_schema_metadata(None)
     with atomic_path(run.results / "episodes.parquet") as temporary:
-        pq.write_table(pa.concat_tables(tables).replace_schema_metadata(None), temporary, compression="zstd")
-    optima = {variant: _optimum(run, domain, variant) for variant in config.variants}
-    return summarise(cells, tables, config, optima)
+        pq.write_table(whole, temporary, compression="zstd")
+    optima = {variant: map_optimum(run.results, domain, variant) for variant in config.variants}
+    return write_results(run.results, whole, config, optima)
 
 
 def ensure_ialm(
@@ -135,7 +151,8 @@ def ensure_ialm(
         "practice_mixture": config.practice_mixture,
         "discount": config.discount,
     }
-    path = run.ialm / "model.json"
+    home = ialm_folder(run, variant)
+    path = home / "model.json"
     if path.is_file() and read_json(path).get("provenance") == provenance:
         return
     from nesy.collection import collect_following
@@ -146,7 +163,7 @@ def ensure_ialm(
 
     experience = Experience.load(run.experience)
     if config.practice_episodes:
-        folder = run.ialm / "practice"
+        folder = home / "practice"
         if path.is_file():
             shutil.rmtree(folder, ignore_errors=True)  # of other settings
         collect_following(
@@ -155,7 +172,14 @@ def ensure_ialm(
         experience = joined(experience, Experience.load(folder))
     codec = SymbolicCodec(load_world_model(run.world_model))
     model = learn_ialm(TwoSliceDBN.load(run.dbn), codec, experience, provenance, config.discount)
-    model.save(run.ialm)
+    model.save(home)
+
+
+def ialm_folder(run: RunFolder, variant: str) -> Path:
+    """Where the planner's model of a variant is: ialm/, and for further variants a folder of its own in there."""
+    path = run.ialm / "model.json"
+    first = read_json(path).get("provenance", {}).get("variant", variant) if path.is_file() else variant
+    return run.ialm if first == variant else run.ialm / variant
 
 
 def run_cell(
@@ -168,69 +192,34 @@ def run_cell(
     advance: Callable[[int], None] = lambda count: None,
 ) -> None:
     """Run one cell and write its episodes (and the trained policy, if it learns)."""
-    from planners.cells import build_agent
+    from planners.cells import build_player
 
     run, domain = RunFolder(folder), load_domain(domain_name)
-    agent, perception, training = build_agent(cell, run, domain, config, seed, progress, advance)
+    fingerprint = _fingerprint(config, cell, seed)
+    checkpoint = run.policies / f".{cell.name}-{fingerprint[:12]}.checkpoint.safetensors"
+    built = build_player(cell, run, domain, config, seed, progress, checkpoint)
     episodes = _episodes_evaluated(config, cell)
-    results = evaluate(domain, cell.variant, agent, perception, episodes, EVALUATION_SEED + cell.seed, advance)
-    tables = [_table(cell, "train", training)] if training is not None else []
-    table = pa.concat_tables([*tables, _table(cell, "eval", results)])
-    table = table.replace_schema_metadata({"fingerprint": _fingerprint(config, cell, seed)})
-    with atomic_path(_path(run, cell)) as temporary:
+    results = evaluate(domain, cell.variant, built.player, episodes, EVALUATION_SEED + cell.seed, advance)
+    results["experience_steps"] = np.full(episodes, built.experience_steps)
+    tables = [_table(cell, "train", built.training)] if built.training is not None else []
+    table = pa.concat_tables([*tables, _table(cell, "eval", results)], promote_options="default")
+    table = table.replace_schema_metadata({"fingerprint": fingerprint})
+    with atomic_path(cell_path(run, cell)) as temporary:
         pq.write_table(table, temporary, compression="zstd")
+    checkpoint.unlink(missing_ok=True)
 
 
-def summarise(
-    cells: list[Cell], tables: list[pa.Table], config: CompareConfig, optima: dict[str, dict[str, float] | None]
-) -> list[dict[str, Any]]:
-    """One record per (agent, inputs, influence, variant), seeds pooled."""
-    groups: dict[tuple[str, str, str, str], list[int]] = {}
-    for i, cell in enumerate(cells):
-        groups.setdefault((cell.agent, cell.inputs, cell.influence, cell.variant), []).append(i)
-    records = []
-    for (agent, inputs, influence, variant), members in groups.items():
-        rows = [tables[i].filter(pa.compute.equal(tables[i]["phase"], "eval")) for i in members]
-        returns = np.concatenate([row["return"].to_numpy() for row in rows])
-        success = np.concatenate([row["outcome"].to_numpy(zero_copy_only=False) for row in rows]) == "success"
-        milliseconds = np.concatenate([row["ms"].to_numpy() for row in rows])
-        optimum = optima.get(variant)
-        mean_return = bootstrap(returns, seed=0, confidence=config.confidence).as_dict()
-        mean_success = bootstrap(success, seed=0, confidence=config.confidence).as_dict()
-        if agent == "optimum" and optimum is not None:
-            mean_return, mean_success = _exact(optimum["mean_return"]), _exact(optimum["success"])
-        records.append(
-            {
-                "agent": agent,
-                "inputs": inputs,
-                "influence": influence,
-                "variant": variant,
-                "seeds": [cells[i].seed for i in members],
-                "episodes": len(returns),
-                "return": mean_return,
-                "success": mean_success,
-                "ms_per_decision": float(np.median(milliseconds)),
-                "share_of_optimum": None if optimum is None else mean_return["mean"] / optimum["mean_return"],
-            }
-        )
-    return records
+def cell_path(run: RunFolder, cell: Cell) -> Path:
+    """Where a cell leaves its episodes."""
+    return run.results / "cells" / f"{cell.name}.parquet"
 
 
-def _exact(value: float) -> dict[str, Any]:
-    return {**Interval(value, value, value).as_dict(), "low": None, "high": None}
+def _trained_with(path: str) -> tuple[str, str]:
+    """Input set and influence mode of a stored policy."""
+    from planners.dqn import DQNPolicy
 
-
-def _optimum(run: RunFolder, domain: Domain, variant: str) -> dict[str, float] | None:
-    """Mean return and success of the exact optimum; worked out once and kept. None where it is out of reach."""
-    path = run.results / f"optimum-{variant}.json"
-    if not path.is_file():
-        try:
-            oracle = domain.optimum(variant)
-        except DomainError:
-            return None
-        write_json(path, {"mean_return": oracle.mean_return, "success": oracle.success})
-    value = read_json(path)
-    return {name: float(value[name]) for name in ("mean_return", "success")}
+    policy = DQNPolicy.load(Path(path))
+    return policy.inputs, str(policy.trained.get("influence", "perspective-shift"))
 
 
 def _episodes_evaluated(config: CompareConfig, cell: Cell) -> int:
@@ -242,26 +231,28 @@ def _episodes(config: CompareConfig, cell: Cell) -> int:
     return learning + _episodes_evaluated(config, cell)
 
 
-def _path(run: RunFolder, cell: Cell) -> Path:
-    return run.results / "cells" / f"{cell.name}.parquet"
-
-
 def _fingerprint(config: CompareConfig, cell: Cell, seed: int) -> str:
     """What the cell's results depend on, besides the run's earlier steps."""
     relevant: dict[str, Any] = {"cell": asdict(cell), "seed": seed, "episodes": _episodes_evaluated(config, cell)}
     if cell.agent in settings.LEARNING_AGENTS:
-        relevant["dqn"] = asdict(config.dqn)
+        relevant["dqn"] = asdict(replace(config.dqn, checkpoint_seconds=0.0))
     if cell.agent in settings.PLANNING_AGENTS:
-        relevant["search"] = asdict(config.search)
+        relevant["search"] = asdict(config.search_of_cells)
+    try:
+        files = [*config.rules, *([cell.policy] if cell.policy else [])]
+        relevant["files"] = [hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in files]
+    except OSError as error:
+        raise UserError(f"{error.filename}: not readable ({error.strerror})") from None
     return hashlib.sha256(json.dumps(relevant, sort_keys=True).encode()).hexdigest()
 
 
 def _is_done(run: RunFolder, config: CompareConfig, cell: Cell, seed: int) -> bool:
+    fingerprint = _fingerprint(config, cell, seed)
     try:
-        metadata = pq.read_schema(_path(run, cell)).metadata or {}
+        metadata = pq.read_schema(cell_path(run, cell)).metadata or {}
     except (OSError, pa.ArrowException):
         return False  # missing, or cut off: run it again
-    return metadata.get(b"fingerprint", b"").decode() == _fingerprint(config, cell, seed)
+    return metadata.get(b"fingerprint", b"").decode() == fingerprint
 
 
 def _table(cell: Cell, phase: str, columns: Columns) -> pa.Table:
@@ -282,14 +273,9 @@ def _table(cell: Cell, phase: str, columns: Columns) -> pa.Table:
     values["return"] = pa.array(columns["return"], pa.float64())
     values["length"] = pa.array(columns["length"], pa.int64())
     values["outcome"] = pa.array(outcome_names(columns["outcome"]), pa.string())
-    for name, kind in (
-        ("map_id", pa.int64()),
-        ("discounted_return", pa.float64()),
-        ("visible", pa.float64()),
-        ("distance", pa.float64()),
-        ("waits", pa.float64()),
-        ("step", pa.int64()),
-        ("ms", pa.float64()),
-    ):
-        values[name] = pa.array(columns[name], kind) if name in columns else pa.nulls(count, kind)
+    for name in ("map_id", "step", "experience_steps"):
+        values[name] = pa.array(columns[name], pa.int64()) if name in columns else pa.nulls(count, pa.int64())
+    for name in columns:  # the metrics of the domain
+        if name not in values and name != "steps":
+            values[name] = pa.array(np.asarray(columns[name], np.float64), pa.float64(), from_pandas=True)
     return pa.table(values)

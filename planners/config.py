@@ -67,18 +67,17 @@ class DQNConfig:
     """Which endings are only the clock's, so that the value of what would have followed counts."""
     target_period: int = 0
     """Updates between copies of the network into the target network; 0: it moves a little with every update (tau)."""
-    fallback: Literal["mode", "uniform"] = "mode"
-    """What b~ is while the person is out of view: what the influence mode has, or uniform in every mode."""
+    fallback: Literal["mode", "uniform", "published"] = "mode"
+    """What b~ is while the person is out of view: what the influence mode has; uniform in every mode; or, as in the
+    published code, zeros for perspective-shift and what the mode has for the others."""
     checkpoint_seconds: float = 30.0
     """Seconds between the checkpoints that a stopped training goes on from; the results do not depend on it."""
     published_terminals: bool = False
     """As the published code: bootstrap from terminal transitions as if the episode went on."""
     published_target_start: bool = False
     """As the published code: the target network starts from other weights than the network."""
-    published_fallbacks: bool = False
-    """As the published code: where nothing can be imagined, zeros (perspective-shift) or the last b~ (others)."""
     published_sampling: bool = False
-    """As the published code: b and b~ are not distributions but relaxed samples of them (temperature 0.6)."""
+    """As the published code: b~ is not a distribution but a relaxed sample of it (temperature 0.6)."""
     published_occlusion: bool = False
     """As the published code: perfect information has the person unable to look through walls."""
 
@@ -114,7 +113,7 @@ class DQNConfig:
             cls.paper(episodes),
             published_terminals=True,
             published_target_start=True,
-            published_fallbacks=True,
+            fallback="published",
             published_sampling=True,
             published_occlusion=True,
         )
@@ -170,6 +169,9 @@ class CompareConfig:
     """Evaluation episodes per seed for the agents that search (`pomdp` and `search`)."""
     confidence: float = 0.95
     """Coverage of the intervals."""
+    planner_milliseconds: float = 0.0
+    """Time that the agents that search get per decision, instead of a number of simulations; 0 for the number.
+    Agents compare at equal time then, but results no longer repeat exactly."""
     rules: tuple[str, ...] = ()
     """Rule files (docs/asp.md) that no agent may break, neither while it learns nor when it acts."""
     policies: tuple[str, ...] = ()
@@ -178,3 +180,12 @@ class CompareConfig:
     """How the DQN learns."""
     search: SearchConfig = field(default_factory=SearchConfig)
     """How the planners search."""
+
+    @property
+    def search_of_cells(self) -> SearchConfig:
+        """How the planners search here: by time if that is asked for."""
+        if self.planner_milliseconds <= 0:
+            return self.search
+        enough = 1_000_000
+        seconds = self.planner_milliseconds / 1000.0
+        return replace(self.search, time_limit=seconds, simulations=enough, pomdp_py_simulations=enough)

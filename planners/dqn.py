@@ -6,15 +6,20 @@
 
 The sum stops at the end of an episode. What follows the end counts as worth nothing when the task itself ended
 it, and is bootstrapped when only the clock did (`bootstrap`: which truncations count as the clock's).
-Readable top to bottom: network, replay, training, the trained policy.
-Sources: Mnih et al. 2015; van Hasselt et al. 2016 (double); Wang et al. 2016 (dueling); Schaul et al. 2016.
+Readable top to bottom: network, trained policy, learning; the replay memory is planners/memory.py. A mask of
+allowed actions (a shield) holds for exploring, for acting and for the action that the target is made with.
+Sources: Mnih et al. 2015; van Hasselt et al. 2016 (double); Wang et al. 2016 (dueling).
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
-from dataclasses import asdict
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,8 +29,12 @@ from domains.core import OUTCOMES, Domain
 from nesy.errors import UserError
 from nesy.progress import SILENT, Progress
 from nesy.run_folder import atomic_path
+from planners.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from planners.config import DQNConfig
-from planners.perception import Codec, Perception, Percepts
+from planners.memory import Replay
+from planners.perception import Codec, Percepts
+from planners.published import dqn_perception
+from planners.shielding import ActionMask
 
 TIMEOUT = OUTCOMES.index("timeout")
 
@@ -67,85 +76,20 @@ class ValueNetwork(nn.Module):
         return self.value(hidden) + advantage - advantage.mean(dim=1, keepdim=True)
 
 
-class Replay:
-    """The last steps of B environments, as rings [T, B, ...]; n-step targets are put together when sampled."""
-
-    def __init__(self, memory: int, num_envs: int, num_inputs: int) -> None:
-        self.length, self.num_envs = max(memory // num_envs, 2), num_envs
-        shape = (self.length, num_envs)
-        self.state = np.zeros((*shape, num_inputs), np.float32)
-        self.next_state = np.zeros((*shape, num_inputs), np.float32)
-        self.action = np.zeros(shape, np.int64)
-        self.reward = np.zeros(shape, np.float32)
-        self.done = np.zeros(shape, np.bool_)  # the episode ended here
-        self.bootstrap = np.zeros(shape, np.bool_)  # the value of next_state counts
-        self.priority = np.zeros(shape, np.float64)
-        self.written = 0
-
-    def __len__(self) -> int:
-        return min(self.written, self.length) * self.num_envs
-
-    def add(
-        self,
-        state: np.ndarray,
-        action: np.ndarray,
-        reward: np.ndarray,
-        next_state: np.ndarray,
-        done: np.ndarray,
-        bootstrap: np.ndarray,
-    ) -> None:
-        """Add one step of every environment, arrays [B, ...]."""
-        row = self.written % self.length
-        self.state[row], self.next_state[row] = state, next_state
-        self.action[row], self.reward[row] = action, reward
-        self.done[row], self.bootstrap[row] = done, bootstrap
-        self.priority[row] = max(float(self.priority.max()), 1.0) if self.written else 1.0
-        self.written += 1
-
-    def draw(
-        self, count: int, rng: np.random.Generator, prioritised: bool
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(age-ordered row, environment, importance weight) of `count` steps."""
-        rows = min(self.written, self.length)
-        if not prioritised:
-            return rng.integers(rows, size=count), rng.integers(self.num_envs, size=count), np.ones(count, np.float32)
-        chance = self.priority[self._row(np.arange(rows))].reshape(-1) ** 0.6
-        cumulative = np.cumsum(chance)
-        flat = np.searchsorted(cumulative, rng.random(count) * cumulative[-1], side="right").clip(0, len(chance) - 1)
-        weight = (chance[flat] * len(chance) / cumulative[-1]) ** -0.4
-        return flat // self.num_envs, flat % self.num_envs, (weight / weight.max()).astype(np.float32)
-
-    def _row(self, age: np.ndarray) -> np.ndarray:
-        """Ring row of the `age`-th oldest step."""
-        return (age + max(self.written - self.length, 0)) % self.length
-
-    def n_step(
-        self, age: np.ndarray, env: np.ndarray, n: int, discount: float
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """State, action, n-step reward, next state, and the discount of its value (0 where it does not count)."""
-        newest = min(self.written, self.length) - 1
-        total = np.zeros(len(age), np.float32)
-        factor = np.ones(len(age), np.float32)
-        last = age.copy()
-        running = np.ones(len(age), np.bool_)
-        for k in range(n):
-            here = np.minimum(age + k, newest)
-            running &= age + k <= newest
-            rows = self._row(here)
-            total += np.where(running, factor * self.reward[rows, env], 0)
-            last = np.where(running, here, last)
-            factor = np.where(running, factor * discount, factor).astype(np.float32)
-            running = running & ~self.done[rows, env]
-        first, end = self._row(age), self._row(last)
-        factor *= self.bootstrap[end, env]
-        return self.state[first, env], self.action[first, env], total, self.next_state[end, env], factor
-
-
 class DQNPolicy:
     """A trained network with what is needed to use it."""
 
-    def __init__(self, network: ValueNetwork, inputs: str, num_configurations: int, config: DQNConfig) -> None:
+    def __init__(
+        self,
+        network: ValueNetwork,
+        inputs: str,
+        num_configurations: int,
+        config: DQNConfig,
+        trained: Mapping[str, Any] | None = None,
+    ) -> None:
         self.network, self.inputs, self.num_configurations, self.config = network, inputs, num_configurations, config
+        self.trained = dict(trained or {})
+        """What it was trained with: `influence`, `variant`, `seed`, `episodes`, `steps`."""
 
     @torch.no_grad()
     def values(self, percepts: Percepts) -> np.ndarray:
@@ -154,9 +98,10 @@ class DQNPolicy:
         values: np.ndarray = self.network(inputs).numpy()
         return values
 
-    def actions(self, percepts: Percepts) -> np.ndarray:
-        """Greedy actions int64 [B]."""
-        return self.values(percepts).argmax(axis=1)
+    def actions(self, percepts: Percepts, allowed: np.ndarray | None = None) -> np.ndarray:
+        """Greedy actions int64 [B] among the allowed ones, bool [B, A]."""
+        values = self.values(percepts)
+        return (values if allowed is None else np.where(allowed, values, -np.inf)).argmax(axis=1)
 
     def save(self, path: Path) -> None:
         """Write weights and settings into one safetensors file."""
@@ -170,6 +115,7 @@ class DQNPolicy:
             "num_actions": str(self.network.advantage.out_features),
             "num_configurations": str(self.num_configurations),
             "config": json.dumps(asdict(self.config)),
+            "trained": json.dumps(self.trained),
         }
         with atomic_path(path) as temporary:
             save_file(self.network.state_dict(), str(temporary), metadata=metadata)
@@ -191,7 +137,8 @@ class DQNPolicy:
             config = DQNConfig(**{**values, "hidden": tuple(values["hidden"])})
             network = ValueNetwork(int(metadata["num_inputs"]), int(metadata["num_actions"]), config)
             network.load_state_dict(weights)
-            return cls(network, metadata["inputs"], int(metadata["num_configurations"]), config)
+            trained = json.loads(metadata.get("trained", "{}"))
+            return cls(network, metadata["inputs"], int(metadata["num_configurations"]), config, trained)
         except FileNotFoundError:
             raise UserError(f"{path}: no such policy; train it with: nesy compare") from None
         except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
@@ -208,6 +155,8 @@ def train(
     config: DQNConfig,
     seed: int,
     progress: Progress = SILENT,
+    mask: ActionMask | None = None,
+    checkpoint: Path | None = None,
 ) -> tuple[DQNPolicy, dict[str, np.ndarray]]:
     """Train a policy.
 
@@ -220,87 +169,203 @@ def train(
         config: how to learn.
         seed: of everything random here.
         progress: told of finished episodes.
+        mask: the allowed actions; None for all.
+        checkpoint: a file from which a stopped training goes on, with the same results; None to do without.
 
     Returns:
         The policy, and the training episodes in the order in which they ended: `return`, `length`, `outcome`
         (code), `step` (environment steps taken so far).
     """
-    sequence = np.random.SeedSequence([seed, 0xD91])
-    rng, perception_rng = (np.random.default_rng(child) for child in sequence.spawn(2))
     torch.set_num_threads(1)
-    env = domain.make("following", config.num_envs, variant=variant, seed=int(rng.integers(2**31)))
-    perception = Perception(codec, influence, perception_rng)
-    num_actions = len(domain.spec.action_names)
-    num_configurations = domain.spec.geometry.num_configurations
-    generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-
-    def perceive(observation: dict[str, np.ndarray], person_views: np.ndarray) -> np.ndarray:
-        return features(perception(observation, person_views), inputs, num_configurations)
-
-    observation, _ = env.reset(seed=int(rng.integers(2**31)))
-    state = perceive(observation, env.person_views())
-    network = _initialised(ValueNetwork(state.shape[1], num_actions, config), generator)
-    target = _initialised(ValueNetwork(state.shape[1], num_actions, config), generator)
-    if not config.published_target_start:
-        target.load_state_dict(network.state_dict())
-    weights: list[torch.Tensor] = list(network.parameters())
-    target_weights: list[torch.Tensor] = list(target.parameters())
-    optimiser = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
-    replay = Replay(config.memory, config.num_envs, state.shape[1])
-    finished: list[tuple[float, int, int, int]] = []
-    running_return, running_length = np.zeros(config.num_envs), np.zeros(config.num_envs, np.int64)
-    steps, owed, told = 0, 0.0, 0
+    training = Training(domain, codec, inputs, influence, variant, config, seed, mask)
+    if checkpoint is not None:
+        training.resume(checkpoint)
+    told, saved = 0, time.monotonic()
     with progress.task(f"dqn {inputs}/{influence}", config.episodes) as task:
-        while len(finished) < config.episodes:
-            done_share = len(finished) / config.episodes
-            epsilon = config.epsilon_end + (config.epsilon_start - config.epsilon_end) * np.exp(
-                -done_share / config.epsilon_decay
-            )
-            with torch.no_grad():
-                action = network(torch.from_numpy(state)).argmax(dim=1).numpy()
-            explore = rng.random(config.num_envs) < epsilon
-            action = np.where(explore, rng.integers(num_actions, size=config.num_envs), action)
-            observation, reward, terminated, truncated, infos = env.step(action)
-            done = terminated | truncated
-            outcome = infos["outcome_code"]
-            next_state = perceive(observation, env.person_views())
-            arrived = next_state
-            if done.any():  # what followed the ended episodes' last steps is not what the reset brought
-                arrived = next_state.copy()
-                final = {name: values[done] for name, values in infos["final_obs"].items()}
-                arrived[done] = perceive(final, infos["final_person_view"][done])
-            clock = truncated if config.bootstrap == "truncated" else truncated & (outcome == TIMEOUT)
-            bootstrap = np.ones(config.num_envs, np.bool_) if config.published_terminals else ~done | clock
-            replay.add(state, action, reward * config.reward_scale, arrived, done, bootstrap)
-            state = next_state
-            steps += config.num_envs
-            running_return += reward
-            running_length += 1
-            for i in np.flatnonzero(done):
-                finished.append((running_return[i], int(running_length[i]), int(outcome[i]), steps))
-            running_return[done], running_length[done] = 0.0, 0
-            if done.any():
-                recent = float(np.mean([row[0] for row in finished[-200:]]))
-                task.advance(min(int(done.sum()), config.episodes - told), mean_return=recent)
-                told = min(told + int(done.sum()), config.episodes)
-            if steps < config.warm_up:
-                continue
-            owed += config.updates_per_step * config.num_envs
-            for _ in range(int(owed)):
-                rate = config.learning_rate + (config.final_learning_rate - config.learning_rate) * done_share
-                _update(network, target, optimiser, replay, config, rate, rng)
-                with torch.no_grad():
-                    torch._foreach_lerp_(target_weights, weights, config.tau)
-            owed -= int(owed)
-    env.close()  # type: ignore[attr-defined]
-    rows = finished[: config.episodes]
-    episodes = {
-        "return": np.array([row[0] for row in rows]),
-        "length": np.array([row[1] for row in rows]),
-        "outcome": np.array([row[2] for row in rows]),
-        "step": np.array([row[3] for row in rows]),
+        while not training.over:
+            training.step(training.choose())
+            training.learn()
+            new = min(len(training.finished), config.episodes) - told
+            if new > 0:
+                told += new
+                task.advance(new, mean_return=float(np.mean([row[0] for row in training.finished[-200:]])))
+            if checkpoint is not None and time.monotonic() - saved > config.checkpoint_seconds:
+                training.save(checkpoint)
+                saved = time.monotonic()
+    if checkpoint is not None:
+        training.save(checkpoint)
+    training.env.close()
+    columns = zip(*training.finished[: config.episodes], strict=True)
+    return training.policy(), {
+        name: np.array(column) for name, column in zip(("return", "length", "outcome", "step"), columns, strict=True)
     }
-    return DQNPolicy(network, inputs, num_configurations, config), episodes
+
+
+class Training:
+    """One training: choose actions, take a step in all environments, learn from the memory; again and again."""
+
+    def __init__(
+        self,
+        domain: Domain,
+        codec: Codec,
+        inputs: str,
+        influence: str,
+        variant: str,
+        config: DQNConfig,
+        seed: int,
+        mask: ActionMask | None = None,
+    ) -> None:
+        """Set everything up; the arguments are those of `train`."""
+        self.config, self.inputs, self.mask = config, inputs, mask
+        self.about = {"influence": influence, "variant": variant, "seed": seed, "episodes": config.episodes}
+        self.num_actions = len(domain.spec.action_names)
+        self.num_configurations = domain.spec.geometry.num_configurations
+        sequence = np.random.SeedSequence([seed, 0xD91])
+        self.rng, perception_rng = (np.random.default_rng(child) for child in sequence.spawn(2))
+        self.env: Any = domain.make("following", config.num_envs, variant=variant, seed=int(self.rng.integers(2**31)))
+        self.perception = dqn_perception(codec, influence, perception_rng, config)
+        generator = torch.Generator().manual_seed(int(self.rng.integers(2**62)))
+        observation, _ = self.env.reset(seed=int(self.rng.integers(2**31)))
+        self.state, self.allowed = self._perceive(observation, self.env.person_views())
+        # What training this is: its settings, and what its first moment looks like to this world model.
+        settings = json.dumps([self.about, inputs, asdict(replace(config, checkpoint_seconds=0.0))], sort_keys=True)
+        self.fingerprint = hashlib.sha256(settings.encode() + self.state.tobytes()).hexdigest()
+        num_inputs = self.state.shape[1]
+        self.network = _initialised(ValueNetwork(num_inputs, self.num_actions, config), generator)
+        self.target = _initialised(ValueNetwork(num_inputs, self.num_actions, config), generator)
+        if not config.published_target_start:
+            self.target.load_state_dict(self.network.state_dict())
+        self.weights: list[torch.Tensor] = list(self.network.parameters())
+        self.target_weights: list[torch.Tensor] = list(self.target.parameters())
+        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate, fused=True)
+        self.replay = Replay(config.memory, config.num_envs, num_inputs, self.num_actions)
+        self.actions: list[np.ndarray] = []
+        self.finished: list[tuple[float, int, int, int]] = []  # return, length, outcome, steps so far
+        self.totals, self.lengths = np.zeros(config.num_envs), np.zeros(config.num_envs, np.int64)
+        self.steps, self.updates, self.owed = 0, 0, 0.0
+
+    @property
+    def over(self) -> bool:
+        """Whether all episodes have ended."""
+        return len(self.finished) >= self.config.episodes
+
+    def policy(self) -> DQNPolicy:
+        """The policy as it is now."""
+        trained = {**self.about, "steps": self.steps}
+        return DQNPolicy(self.network, self.inputs, self.num_configurations, self.config, trained)
+
+    def _perceive(
+        self, observation: dict[str, np.ndarray], person_views: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """The network's input and the allowed actions."""
+        percepts = self.perception(observation, person_views)
+        allowed = None if self.mask is None else self.mask(percepts.codes, percepts.configurations)
+        return features(percepts, self.inputs, self.num_configurations), allowed
+
+    def choose(self) -> np.ndarray:
+        """Epsilon-greedy actions int64 [B], allowed ones."""
+        config = self.config
+        share = len(self.finished) / config.episodes
+        spread = config.epsilon_start - config.epsilon_end
+        epsilon = config.epsilon_end + spread * np.exp(-share / config.epsilon_decay)
+        with torch.no_grad():
+            values = self.network(torch.from_numpy(self.state)).numpy()
+        explore = self.rng.random(config.num_envs) < epsilon
+        at_random = self.rng.integers(self.num_actions, size=config.num_envs)
+        if self.allowed is not None:
+            values = np.where(self.allowed, values, -np.inf)
+            at_random = np.where(self.allowed, self.rng.random(self.allowed.shape), -1.0).argmax(axis=1)
+        return np.where(explore, at_random, values.argmax(axis=1))
+
+    def step(self, action: np.ndarray) -> None:
+        """Take actions [B] and remember what came of them."""
+        config = self.config
+        observation, reward, terminated, truncated, infos = self.env.step(action)
+        done, outcome = terminated | truncated, infos["outcome_code"]
+        state, allowed = self._perceive(observation, self.env.person_views())
+        arrived, then_allowed = state, allowed
+        if done.any():  # what followed the ended episodes' last steps is not what the reset brought
+            arrived = state.copy()
+            final = {name: values[done] for name, values in infos["final_obs"].items()}
+            arrived[done], final_allowed = self._perceive(final, infos["final_person_view"][done])
+            if allowed is not None:
+                then_allowed = allowed.copy()
+                then_allowed[done] = final_allowed
+        clock = truncated if config.bootstrap == "truncated" else truncated & (outcome == TIMEOUT)
+        bootstrap = np.ones(len(done), np.bool_) if config.published_terminals else ~done | clock
+        self.replay.add(self.state, action, reward * config.reward_scale, arrived, then_allowed, done, bootstrap)
+        self.state, self.allowed = state, allowed
+        self.actions.append(action.astype(np.uint8))
+        self.steps += len(done)
+        self.totals += reward
+        self.lengths += 1
+        for i in np.flatnonzero(done):
+            self.finished.append((float(self.totals[i]), int(self.lengths[i]), int(outcome[i]), self.steps))
+        self.totals[done], self.lengths[done] = 0.0, 0
+
+    def learn(self) -> None:
+        """The updates that the steps taken so far are worth."""
+        config = self.config
+        if self.steps < config.warm_up:
+            return
+        share = min(len(self.finished) / config.episodes, 1.0)
+        rate = config.learning_rate + (config.final_learning_rate - config.learning_rate) * share
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        self.owed += config.updates_per_step * config.num_envs
+        for _ in range(int(self.owed)):
+            self._update()
+        self.owed -= int(self.owed)
+
+    def _update(self) -> None:
+        """One gradient step on one batch, and the target network after it."""
+        config, network = self.config, self.network
+        age, env, weight = self.replay.draw(config.batch_size, self.rng, config.prioritised)
+        batch = self.replay.n_step(age, env, config.n_step, config.discount)
+        state, action, reward, next_state, factor, allowed = (torch.from_numpy(part) for part in batch)
+        with torch.no_grad():
+            next_values = self.target(next_state)
+            chooser = network(next_state) if config.double else next_values
+            if self.mask is not None:
+                chooser = chooser.masked_fill(~allowed, -torch.inf)
+            best = next_values.gather(1, chooser.argmax(dim=1, keepdim=True)).squeeze(1)
+            goal = reward + factor * best
+        value = network(state).gather(1, action[:, None]).squeeze(1)
+        loss = (nn.functional.smooth_l1_loss(value, goal, reduction="none") * torch.from_numpy(weight)).mean()
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        nn.utils.clip_grad_norm_(network.parameters(), config.gradient_clip)
+        self.optimiser.step()
+        if config.prioritised:
+            self.replay.priority[self.replay.row(age), env] = (value.detach() - goal).abs().numpy() + 1e-3
+        self.updates += 1
+        with torch.no_grad():
+            if not config.target_period:
+                torch._foreach_lerp_(self.target_weights, self.weights, config.tau)
+            elif self.updates % config.target_period == 0:
+                self.target.load_state_dict(network.state_dict())
+
+    def save(self, path: Path) -> None:
+        """Write a checkpoint."""
+        actions = np.array(self.actions, np.uint8).reshape(-1, self.config.num_envs)
+        rows = min(self.replay.written, self.replay.length) if self.config.prioritised else 0
+        state = {"random": self.rng.bit_generator.state, "owed": self.owed, "updates": self.updates}
+        checkpoint = Checkpoint(actions, self.replay.priority[:rows], state)
+        save_checkpoint(path, self.fingerprint, self._networks(), self.optimiser, checkpoint)
+
+    def resume(self, path: Path) -> None:
+        """Go on from a checkpoint of this training, where there is one."""
+        stored = load_checkpoint(path, self.fingerprint, self._networks(), self.optimiser)
+        if stored is None:
+            return
+        for action in stored.actions:
+            self.step(action.astype(np.int64))
+        self.rng.bit_generator.state = stored.state["random"]
+        self.owed, self.updates = float(stored.state["owed"]), int(stored.state["updates"])
+        self.replay.priority[: len(stored.priorities)] = stored.priorities
+
+    def _networks(self) -> dict[str, nn.Module]:
+        return {"network": self.network, "target": self.target}
 
 
 def _initialised(network: ValueNetwork, generator: torch.Generator) -> ValueNetwork:
@@ -312,33 +377,3 @@ def _initialised(network: ValueNetwork, generator: torch.Generator) -> ValueNetw
                 module.weight.uniform_(-bound, bound, generator=generator)
                 module.bias.uniform_(-bound, bound, generator=generator)
     return network
-
-
-def _update(
-    network: ValueNetwork,
-    target: ValueNetwork,
-    optimiser: torch.optim.Optimizer,
-    replay: Replay,
-    config: DQNConfig,
-    rate: float,
-    rng: np.random.Generator,
-) -> None:
-    """One gradient step on one batch."""
-    age, env, weight = replay.draw(config.batch_size, rng, config.prioritised)
-    batch = replay.n_step(age, env, config.n_step, config.discount)
-    state, action, reward, next_state, factor = (torch.from_numpy(part) for part in batch)
-    with torch.no_grad():
-        next_values = target(next_state)
-        chooser = network(next_state) if config.double else next_values
-        best = next_values.gather(1, chooser.argmax(dim=1, keepdim=True)).squeeze(1)
-        goal = reward + factor * best
-    value = network(state).gather(1, action[:, None]).squeeze(1)
-    loss = (nn.functional.smooth_l1_loss(value, goal, reduction="none") * torch.from_numpy(weight)).mean()
-    for group in optimiser.param_groups:
-        group["lr"] = rate
-    optimiser.zero_grad(set_to_none=True)
-    loss.backward()
-    nn.utils.clip_grad_norm_(network.parameters(), config.gradient_clip)
-    optimiser.step()
-    if config.prioritised:
-        replay.priority[replay._row(age), env] = (value.detach() - goal).abs().numpy() + 1e-3

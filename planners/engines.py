@@ -1,16 +1,16 @@
-"""Where the cells of a comparison run: in this process, or in several on this machine.
+"""Where the cells of a comparison run: in this process, in several on this machine, or on a Ray cluster.
 
 A cell is a pure function of files and seeds and writes its own result, so an engine only has to see to it that
-every cell is run; a cell whose process dies is run again.
+every cell is run. A cell whose worker dies is run again; other cells do not notice.
 """
 
 from __future__ import annotations
 
 import multiprocessing
 import os
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections import deque
 from contextlib import contextmanager
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,18 +26,19 @@ if TYPE_CHECKING:
 CellJob = tuple["Cell", Path, "CompareConfig", int, str]
 """What `planners.compare.run_cell` is called with."""
 
-_ATTEMPTS = 3
-_reports: Any = None  # in a worker process: where it reports finished episodes
+ENGINES = ("local", "ray")
+ATTEMPTS = 8
+"""Times that one cell is begun before its deaths are taken for its own fault."""
 
 
-class _Relay:
+class Relay:
     """A progress that hands finished units on, whatever the stage."""
 
     def __init__(self, advance: Any) -> None:
         self._advance = advance
 
     @contextmanager
-    def task(self, description: str, total: int) -> Iterator[_Relay]:
+    def task(self, description: str, total: int) -> Iterator[Relay]:
         """A stage; its units count towards the whole grid."""
         yield self
 
@@ -46,57 +47,156 @@ class _Relay:
         self._advance(steps)
 
 
-def run_cells(jobs_of: list[CellJob], jobs: int, task: Task) -> None:
-    """Run every cell, in this process or in `jobs` of them."""
+class Tally:
+    """Progress of the grid: a cell that is run again does not count what it had done before a second time."""
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        self.counted: dict[str, int] = {}
+
+    def report(self, name: str, done: int) -> None:
+        """The cell has done so many episodes in its present attempt."""
+        new = done - self.counted.get(name, 0)
+        if new > 0:
+            self.counted[name] = done
+            self.task.advance(new)
+
+
+def run_cells(jobs_of: list[CellJob], jobs: int, task: Task, engine: str = "local", address: str | None = None) -> None:
+    """Run every cell.
+
+    Args:
+        jobs_of: the cells.
+        jobs: processes of the engine `local`; with 1, this one.
+        task: told of finished episodes.
+        engine: one of `ENGINES`.
+        address: of the Ray cluster.
+
+    Raises:
+        UserError: an unknown engine, Ray is missing or out of reach, or workers keep dying on one cell.
+    """
+    if engine not in ENGINES:
+        raise UserError(f"unknown engine '{engine}' (known: {', '.join(ENGINES)})")
     if not jobs_of:
         return
-    if jobs == 1 or len(jobs_of) == 1:
+    if engine == "ray":
+        from planners.ray_engine import run_on_ray
+
+        run_on_ray(jobs_of, task, address)
+    elif jobs == 1 or len(jobs_of) == 1:
         for job in jobs_of:
-            _run(job, task.advance)
-        return
-    _run_in_processes(jobs_of, jobs, task)
+            run_job(job, task.advance)
+    else:
+        _run_in_processes(jobs_of, jobs, Tally(task))
 
 
-def _run(job: CellJob, advance: Any) -> None:
+def run_job(job: CellJob, advance: Any) -> None:
+    """Run one cell here; `advance` is told how many more episodes are done."""
     from planners.compare import run_cell
 
-    run_cell(*job, progress=_Relay(advance), advance=advance)
+    run_cell(*job, progress=Relay(advance), advance=advance)
 
 
-def _run_in_processes(jobs_of: list[CellJob], jobs: int, task: Task) -> None:
+def give_up(name: str, remedy: str) -> UserError:
+    """The error for a cell that workers keep dying on."""
+    return UserError(f"{name}: its worker died {ATTEMPTS} times (out of memory?); {remedy}")
+
+
+class _Worker:
+    """A process that runs one cell after another; it is given a cell through a pipe, and reports through it."""
+
+    def __init__(self, context: Any) -> None:
+        self.pipe, theirs = context.Pipe()
+        self.process = context.Process(target=_serve, args=(theirs,), daemon=True)
+        self.process.start()
+        theirs.close()  # so that the pipe ends when the process does
+        self.job: CellJob | None = None
+
+    def begin(self, job: CellJob) -> None:
+        self.job = job
+        self.pipe.send(job)
+
+
+def _run_in_processes(jobs_of: list[CellJob], jobs: int, tally: Tally) -> None:
     context = multiprocessing.get_context("spawn")
-    waiting = list(jobs_of)
-    for _ in range(_ATTEMPTS):
-        reports = context.SimpleQueue()
-        failed: list[CellJob] = []
-        with ProcessPoolExecutor(min(jobs, len(waiting)), context, _begin_worker, (reports,)) as pool:
-            futures: dict[Future[None], CellJob] = {pool.submit(_work, job): job for job in waiting}
-            running = set(futures)
-            try:
-                while running:
-                    done, running = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
-                    while not reports.empty():
-                        task.advance(reports.get())
-                    for future in done:
-                        try:
-                            future.result()
-                        except BrokenProcessPool:
-                            failed.append(futures[future])
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
-        if not failed:
-            return
-        waiting = failed
-    names = ", ".join(job[0].name for job in waiting)
-    raise UserError(f"worker processes keep dying ({_ATTEMPTS} attempts); still to do: {names}; try fewer --jobs")
+    waiting, attempts = deque(jobs_of), dict.fromkeys((job[0].name for job in jobs_of), 0)
+    workers: list[_Worker] = []
+    try:
+        while waiting or any(worker.job is not None for worker in workers):
+            while waiting and len(workers) < jobs:
+                workers.append(_Worker(context))
+            for worker in workers:
+                if worker.job is None and waiting:
+                    _hand_over(worker, waiting, attempts)
+            for pipe in wait([worker.pipe for worker in workers]):
+                worker = next(worker for worker in workers if worker.pipe is pipe)
+                if not _heard(worker, tally):  # it died
+                    worker.process.join()
+                    workers.remove(worker)
+                    if worker.job is not None:
+                        waiting.appendleft(worker.job)
+    finally:
+        for worker in workers:
+            worker.process.terminate()
+            worker.process.join()
 
 
-def _begin_worker(reports: Any) -> None:
-    global _reports
-    _reports = reports
+def _hand_over(worker: _Worker, waiting: deque[CellJob], attempts: dict[str, int]) -> None:
+    job = waiting.popleft()
+    attempts[job[0].name] += 1
+    if attempts[job[0].name] > ATTEMPTS:
+        raise give_up(job[0].name, "try fewer --jobs")
+    try:
+        worker.begin(job)
+    except OSError:  # it died before it could be told; its pipe says so next
+        worker.job = job
+
+
+def _heard(worker: _Worker, tally: Tally) -> bool:
+    """Take one message of a worker; False if it is dead."""
+    try:
+        kind, value = worker.pipe.recv()
+    except (EOFError, OSError):
+        return False
+    if kind == "failed":
+        raise value
+    if worker.job is not None:
+        if kind == "progress":
+            tally.report(worker.job[0].name, value)
+        else:
+            worker.job = None
+    return True
+
+
+def _serve(pipe: Connection) -> None:
+    """The life of a worker process: cells come in through the pipe until it closes."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    while True:
+        try:
+            job: CellJob = pipe.recv()
+        except EOFError:
+            return
+        done = 0
+
+        def advance(count: int = 1, **_: float) -> None:
+            nonlocal done
+            done += count
+            pipe.send(("progress", done))
+
+        try:
+            run_job(job, advance)
+        except Exception as error:
+            pipe.send(("failed", _sendable(error)))
+            return
+        pipe.send(("done", None))
 
 
-def _work(job: CellJob) -> None:
-    _run(job, lambda count=1, **_: _reports.put(count))
+def _sendable(error: Exception) -> Exception:
+    """The error as the parent can raise it: a caller's mistake as it is, a bug of ours with its traceback."""
+    import traceback
+
+    from domains.core import DomainError
+
+    if type(error) in (UserError, DomainError):
+        return type(error)(str(error))
+    return RuntimeError("in a worker process:\n" + "".join(traceback.format_exception(error)))

@@ -1,6 +1,7 @@
 """Playing episodes with an agent and writing down what came of them: one row per episode.
 
-All agents meet the same maps and the same random seeds: episode e of a variant always starts alike.
+All agents meet the same maps and the same random seeds: episode e of a variant always starts alike. Where there are
+rules, no agent breaks them: what an agent chooses against them is replaced.
 """
 
 from __future__ import annotations
@@ -11,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from domains.core import OUTCOMES, Domain, DomainError
+from domains.core import OUTCOMES, STAY, Domain, DomainError, StepRecorder
 from planners.agents import Agent, Situation
-from planners.perception import Perception
+from planners.perception import Codec, Perception, Percepts
+from planners.shielding import ActionMask
 
 Columns = dict[str, np.ndarray]
 
@@ -33,11 +35,51 @@ def evaluation_maps(domain: Domain, variant: str, episodes: int) -> np.ndarray |
     return np.asarray(grids[np.searchsorted(ends, (np.arange(episodes) + 0.5) / episodes).clip(0, len(grids) - 1)])
 
 
+class Player:
+    """An agent with all it needs to act: its perception, and the rules that it has to keep."""
+
+    def __init__(
+        self,
+        agent: Agent,
+        perception: Perception | None = None,
+        mask: ActionMask | None = None,
+        codec: Codec | None = None,
+    ) -> None:
+        """Put a player together.
+
+        Args:
+            agent: acts.
+            perception: encodes for agents that need it, else None.
+            mask: the rules; None without.
+            codec: encodes for the rules where the agent has no perception.
+        """
+        self.agent, self.perception, self.mask = agent, perception, mask
+        self.codec = codec if perception is None else perception.codec
+        assert mask is None or self.codec is not None
+
+    def decide(
+        self, env: Any, observation: dict[str, np.ndarray], active: np.ndarray, last: np.ndarray | None
+    ) -> tuple[np.ndarray, Percepts | None]:
+        """Actions int64 [B] in the present situations, and what was perceived."""
+        percepts = None if self.perception is None else self.perception(observation, env.person_views())
+        allowed = None
+        if self.mask is not None and self.codec is not None:
+            codes = self.codec.codes(observation["view"]) if percepts is None else percepts.codes
+            allowed = self.mask(codes, np.asarray(observation["configuration"], np.int64))
+        actions = np.asarray(self.agent.actions(Situation(env, observation, percepts, active, last, allowed)), np.int64)
+        return (actions if allowed is None else permitted(actions, allowed)), percepts
+
+
+def permitted(actions: np.ndarray, allowed: np.ndarray) -> np.ndarray:
+    """Actions [B]; where one is not among the allowed, bool [B, A], to stay, or else the first allowed action."""
+    instead = np.where(allowed[:, STAY], STAY, allowed.argmax(axis=1))
+    return np.where(allowed[np.arange(len(actions)), actions], actions, instead)
+
+
 def evaluate(
     domain: Domain,
     variant: str,
-    agent: Agent,
-    perception: Perception | None,
+    player: Player,
     episodes: int,
     seed: int,
     advance: Callable[[int], None] = lambda count: None,
@@ -47,62 +89,60 @@ def evaluate(
     Args:
         domain: gives the environments.
         variant: of the task.
-        agent: acts.
-        perception: encodes for agents that need it, else None.
+        player: acts.
         episodes: how many.
         seed: of the environments; the same for all agents.
         advance: told how many more episodes have ended.
 
     Returns:
-        Columns [episodes]: return, length, outcome (code), map_id, discounted_return, visible (share of the
-        steps), distance (mean), waits (steps that the person waited), and ms (milliseconds per decision).
+        Columns [episodes]: return, length, outcome (code), map_id, discounted_return, ms_per_decision, and every
+        metric of the domain (docs/metrics.md); of beliefs only for players with a perception.
     """
     maps = evaluation_maps(domain, variant, episodes)
     env: Any = domain.make("following", episodes, variant=variant, seed=seed, maps=maps, cycle=True)
     observation, _ = env.reset(seed=seed)
+    recorder = StepRecorder(env)
     map_ids = np.array(env.map_ids())
-    totals = {name: np.zeros(episodes) for name in ("return", "discounted_return", "visible", "distance", "waits")}
+    discounted, spent = np.zeros(episodes), np.zeros(episodes)
     length, outcome = np.zeros(episodes, np.int64), np.zeros(episodes, np.int64)
-    spent = np.zeros(episodes)
     active = np.ones(episodes, np.bool_)
     last: np.ndarray | None = None
     factor = 1.0
     while active.any():
-        person_views = env.person_views()
         started = time.perf_counter()
-        percepts = None if perception is None else perception(observation, person_views)
-        actions = agent.actions(Situation(env, observation, percepts, active, last))
+        actions, percepts = player.decide(env, observation, active, last)
         spent[active] += (time.perf_counter() - started) / active.sum()
+        beliefs = {} if percepts is None else _belief_metrics(domain, player, percepts, env.person_views())
         observation, reward, terminated, truncated, infos = env.step(actions)
-        values = {
-            "return": reward,
-            "discounted_return": factor * np.asarray(reward),
-            "visible": infos["visible"],
-            "distance": infos["distance"],
-            "waits": infos["person_waited"],
-        }
-        for name, value in values.items():
-            totals[name][active] += np.asarray(value, np.float64)[active]
+        recorder.step(actions, reward, infos, beliefs)
+        discounted[active] += factor * np.asarray(reward)[active]
         length[active] += 1
         ended = active & (np.asarray(terminated) | np.asarray(truncated))
         outcome[ended] = np.asarray(infos["outcome_code"])[ended]
         active = active & ~ended
         factor *= 0.9
-        last = np.asarray(actions)
+        last = actions
         if ended.any():
             advance(int(ended.sum()))
+    metrics = domain.episode_metrics(recorder.steps(), variant)
     env.close()
+    first = metrics["episode"] == 0  # ordered by environment; environments went on with further episodes
     return {
-        "return": totals["return"],
+        **{name: values[first] for name, values in metrics.items() if name not in ("environment", "episode")},
         "length": length,
         "outcome": outcome,
         "map_id": map_ids,
-        "discounted_return": totals["discounted_return"],
-        "visible": totals["visible"] / length,
-        "distance": totals["distance"] / length,
-        "waits": totals["waits"],
-        "ms": 1000.0 * spent / length,
+        "discounted_return": discounted,
+        "ms_per_decision": 1000.0 * spent / length,
     }
+
+
+def _belief_metrics(domain: Domain, player: Player, percepts: Percepts, person_views: np.ndarray) -> Columns:
+    """How well b~ agrees with what the person truly sees: arrays [B]."""
+    assert player.perception is not None
+    codec: Any = player.perception.codec
+    decoded = codec.views(percepts.shifted.argmax(axis=-1).astype(np.uint8))
+    return domain.belief_metrics(percepts.shifted, codec.codes(person_views), decoded, person_views)
 
 
 def outcome_names(codes: np.ndarray) -> list[str]:

@@ -25,8 +25,8 @@ from domains.core import Domain, load_domain
 from nesy.errors import UserError
 from nesy.progress import SILENT, Progress
 from nesy.run_folder import RunFolder, atomic_path, read_json
-from planners.agents import Agent, Situation
-from planners.cells import cell_seed, restored_agent
+from planners.agents import Agent
+from planners.cells import cell_seed, restored_player
 from planners.compare import EVALUATION_SEED, Cell, grid
 from planners.config import CompareConfig
 from planners.evaluation import evaluation_maps
@@ -221,7 +221,8 @@ def _play(
     maps: dict[str, int],
 ) -> list[dict[str, Any]]:
     """Play the cell's episodes as `planners.evaluation.evaluate` does, deciding and recording in the chosen ones."""
-    agent, perception = restored_agent(cell, run, domain, config, seed)
+    player = restored_player(cell, run, domain, config, seed)
+    agent, perception = player.agent, player.perception
     watching = perception or _onlooker(run, cell_seed(cell, seed))
     shield = _shield(config, watching, domain) if perception is not None else None
     start_maps = evaluation_maps(domain, cell.variant, episodes)
@@ -236,9 +237,8 @@ def _play(
     last: np.ndarray | None = None
     while active.any():
         person_views = env.person_views()
-        percepts = watching(observation, person_views)
-        situation = Situation(env, observation, None if perception is None else percepts, active, last)
-        actions = np.asarray(agent.actions(situation))
+        actions, perceived = player.decide(env, observation, active, last)
+        percepts = watching(observation, person_views) if perceived is None else perceived
         states = env.states()
         moments = {
             int(i): {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -15,6 +15,10 @@ from planners.config import CompareConfig
 class Arguments(pipeline.CommonArguments):
     """Options of `nesy compare`."""
 
+    engine: Literal["local", "ray"] = "local"
+    """Where the grid runs: processes of this machine (--jobs), or a Ray cluster."""
+    address: str | None = None
+    """Address of the Ray cluster; by default the one that Ray finds, or one on this machine alone."""
     settings: Annotated[CompareConfig, tyro.conf.arg(name="")] = CompareConfig()
 
 
@@ -26,7 +30,7 @@ def defaults(arguments: list[str]) -> Arguments:
 def run(options: Arguments) -> dict[str, Any]:
     """Run the cells of the grid that the run folder does not hold yet."""
     with pipeline.opened(options, "compare", compare=options.settings) as steps:
-        return steps.compare()
+        return steps.compare(options.engine, options.address)
 
 
 def show(result: dict[str, Any]) -> None:

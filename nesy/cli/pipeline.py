@@ -246,8 +246,8 @@ class Pipeline:
             self.run.update_summary(dbn=figures)
         return dict(self.run.read_summary()["dbn"])
 
-    def compare(self) -> dict[str, Any]:
-        """Compare the agents."""
+    def compare(self, engine: str = "local", address: str | None = None) -> dict[str, Any]:
+        """Compare the agents, with an engine of `planners.engines`."""
         self.run.require("collect", "train", "extract")
         from planners.compare import compare
 
@@ -260,6 +260,8 @@ class Pipeline:
                 seed=self.config.seed,
                 jobs=self.jobs,
                 progress=self.progress,
+                engine=engine,
+                address=address,
             ),
         )
         self.run.update_summary(comparison=cells)

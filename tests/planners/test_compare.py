@@ -12,7 +12,7 @@ from nesy.run_folder import RunFolder
 from planners.baselines import LastSeenFollower, OracleFollower
 from planners.compare import EVALUATION_SEED, compare, grid
 from planners.config import CompareConfig
-from planners.evaluation import evaluate
+from planners.evaluation import Player, evaluate
 
 REFERENCES = CompareConfig(agents=("greedy-follower", "random", "greedy-last-seen"), episodes=42)
 
@@ -20,12 +20,14 @@ REFERENCES = CompareConfig(agents=("greedy-follower", "random", "greedy-last-see
 @pytest.fixture(autouse=True)
 def _no_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
     """The exact optimum takes seconds and has tests of its own."""
-    monkeypatch.setattr("planners.compare._optimum", lambda run, domain, variant: {"mean_return": 90.0, "success": 0.8})
+    monkeypatch.setattr(
+        "planners.results.map_optimum", lambda *_: {"mean_return": 90.0, "success": 0.8, "maps": []}
+    )
 
 
 def _rows(run: RunFolder) -> dict[str, list[object]]:
     columns = pq.read_table(run.results / "episodes.parquet").to_pydict()
-    del columns["ms"]
+    del columns["ms_per_decision"]
     return columns
 
 
@@ -54,10 +56,10 @@ def test_a_finished_cell_is_not_run_again_and_a_damaged_one_is(tmp_path: Path) -
 
 def test_followers_reach_the_known_figures() -> None:
     domain = load_domain()
-    follower = evaluate(domain, "paper", OracleFollower(), None, 42, EVALUATION_SEED)
+    follower = evaluate(domain, "paper", Player(OracleFollower()), 42, EVALUATION_SEED)
     assert follower["return"].mean() == pytest.approx(90.3, abs=0.7)
     assert (follower["outcome"] == 1).mean() == pytest.approx(0.807, abs=0.01)
-    last_seen = evaluate(domain, "paper", LastSeenFollower(domain.spec.geometry), None, 42, EVALUATION_SEED)
+    last_seen = evaluate(domain, "paper", Player(LastSeenFollower(domain.spec.geometry)), 42, EVALUATION_SEED)
     assert last_seen["return"].mean() > 85
     assert np.unique(follower["map_id"]).size == 42
 
@@ -67,7 +69,7 @@ def test_mistakes_are_named() -> None:
         ({"agents": ("dqm",)}, "unknown agent 'dqm'"),
         ({"inputs": ("all",)}, "unknown input set 'all'"),
         ({"influences": ("telepathy",)}, "unknown influence mode 'telepathy'"),
-        ({"agents": ()}, "list of agents is empty"),
+        ({"agents": ()}, "lists of agents and of policies are empty"),
         ({"episodes": 0}, "at least one evaluation episode"),
     ):
         with pytest.raises(UserError, match=message):

@@ -9,20 +9,21 @@ import torch
 
 from nesy.errors import UserError
 from planners.config import DQNConfig
-from planners.dqn import DQNPolicy, Replay, ValueNetwork, features
+from planners.dqn import DQNPolicy, ValueNetwork, features
+from planners.memory import Replay
 from planners.perception import Percepts
 
 
 def _replay(rewards: list[float], done: list[bool], bootstrap: list[bool], memory: int = 10) -> Replay:
-    replay = Replay(memory, 1, 1)
+    replay = Replay(memory, 1, 1, 4)
     for t, (reward, end, goes_on) in enumerate(zip(rewards, done, bootstrap, strict=True)):
         state, after = np.array([[float(t)]]), np.array([[t + 1.0]])
-        replay.add(state, np.array([t % 4]), np.array([reward]), after, np.array([end]), np.array([goes_on]))
+        replay.add(state, np.array([t % 4]), np.array([reward]), after, None, np.array([end]), np.array([goes_on]))
     return replay
 
 
 def _targets(replay: Replay, age: int, n: int) -> tuple[float, float, float]:
-    _, _, total, after, factor = replay.n_step(np.array([age]), np.array([0]), n, 0.5)
+    _, _, total, after, factor, _ = replay.n_step(np.array([age]), np.array([0]), n, 0.5)
     return float(total[0]), float(after[0, 0]), float(factor[0])
 
 

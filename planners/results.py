@@ -1,0 +1,284 @@
+"""What a comparison leaves in results/: one record per agent and condition, and tables and plots for papers.
+
+episodes (all seeds pooled) -> records (means, interquartile means, intervals, regret, share of the optimum)
+                            -> comparison.parquet .csv .md .tex, regret.parquet .csv, statistics.json, plots
+
+Intervals: stratified by map, since every agent meets the same maps; for agents that learn, with three seeds or more,
+over seeds, since the episodes of one training have that training in common.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from domains.core import Domain, DomainError
+from nesy.run_folder import atomic_path, read_json, write_json
+from planners.config import ORACLES, CompareConfig
+from planners.statistics import (
+    Interval,
+    interquartile_mean,
+    over_seeds,
+    performance_profile,
+    probability_of_improvement,
+    running_average,
+    stratified_bootstrap,
+)
+
+Optimum = dict[str, Any]
+"""`mean_return`, `success`, and, where maps can be listed, `maps`: [{map_id, return, success}]."""
+CONDITION = ("agent", "inputs", "influence", "variant")
+METRICS_OF_NO_EPISODE = ("seed", "phase", "episode", "outcome", "map_id", "step", *CONDITION)
+MOST_POINTS = 400
+"""Points of a stored learning curve."""
+
+
+def write_results(
+    folder: Path, episodes: pa.Table, config: CompareConfig, optima: dict[str, Optimum | None]
+) -> list[dict[str, Any]]:
+    """Sum up and write every table; returns the `comparison` list of summary.json."""
+    from nesy.report.comparison_figures import save_figures
+
+    played = _groups(episodes, "eval")
+    records = [_record(condition, rows, config, optima) for condition, rows in played.items()]
+    regrets = [row for condition, rows in played.items() for row in _regrets(condition, rows, optima)]
+    statistics = {
+        "confidence": config.confidence,
+        "profiles": _profiles(played),
+        "improvement": _improvements(played, config),
+        "curves": [_curve(condition, rows, config) for condition, rows in _groups(episodes, "train").items()],
+    }
+    _write_tables(folder, records, regrets)
+    write_json(folder / "statistics.json", statistics)
+    save_figures(folder / "plots", records, statistics)
+    return records
+
+
+def map_optimum(folder: Path, domain: Domain, variant: str) -> Optimum | None:
+    """Return and success of the exact optimum, by map too; worked out once and kept. None where it is out of reach."""
+    path = folder / f"optimum-{variant}.json"
+    if path.is_file() and "maps" in (kept := read_json(path)):
+        return dict(kept)
+    try:
+        oracle = domain.optimum(variant)
+        grids, _ = domain.maps(variant)
+    except DomainError:
+        return None
+    maps = []
+    if len(grids) == len(oracle.map_return):
+        env: Any = domain.make("following", len(grids), variant=variant, seed=0, maps=grids, cycle=True)
+        env.reset(seed=0)
+        maps = [
+            {"map_id": int(name), "return": float(value), "success": float(success)}
+            for name, value, success in zip(env.map_ids(), oracle.map_return, oracle.map_success, strict=True)
+        ]
+        env.close()
+    value = {"mean_return": oracle.mean_return, "success": oracle.success, "maps": maps}
+    write_json(path, value)
+    return value
+
+
+def _groups(episodes: pa.Table, phase: str) -> dict[tuple[str, ...], dict[str, np.ndarray]]:
+    """Rows of one phase by condition, in the order of the table, as columns."""
+    rows = episodes.filter(pa.compute.equal(episodes["phase"], phase))
+    columns = {name: rows[name].to_numpy() for name in rows.column_names}
+    keys = list(zip(*(columns[name] for name in CONDITION), strict=True))
+    groups: dict[tuple[str, ...], list[int]] = {}
+    for position, key in enumerate(keys):
+        groups.setdefault(tuple(key), []).append(position)
+    return {key: {name: column[rows] for name, column in columns.items()} for key, rows in groups.items()}
+
+
+def _interval(values: np.ndarray, rows: dict[str, np.ndarray], config: CompareConfig, robust: bool = False) -> Interval:
+    seeds = rows["seed"]
+    if rows["experience_steps"].max() > 0 and len(np.unique(seeds)) >= 3 and not robust:
+        return over_seeds(values, seeds, 0, config.confidence)
+    statistic = interquartile_mean if robust else np.mean
+    return stratified_bootstrap(values, rows["map_id"], 0, config.confidence, statistic)
+
+
+def _record(
+    condition: tuple[str, ...], rows: dict[str, np.ndarray], config: CompareConfig, optima: dict[str, Optimum | None]
+) -> dict[str, Any]:
+    returns, success = rows["return"], (rows["outcome"] == "success").astype(np.float64)
+    optimum = optima.get(rows["variant"][0])
+    mean_return = _interval(returns, rows, config).as_dict()
+    mean_success = _interval(success, rows, config).as_dict()
+    record: dict[str, Any] = dict(zip(CONDITION, (str(part) for part in condition), strict=True))
+    if record["agent"] == "optimum" and optimum is not None:
+        mean_return, mean_success = _exact(optimum["mean_return"]), _exact(optimum["success"])
+    metrics = {
+        name: float(np.nanmean(column))
+        for name, column in rows.items()
+        if name not in METRICS_OF_NO_EPISODE and column.dtype.kind in "fi" and not np.isnan(column.astype(float)).all()
+    }
+    regret = _regret_of(rows, optimum)
+    return {
+        **record,
+        "seeds": [int(seed) for seed in np.unique(rows["seed"])],
+        "episodes": len(returns),
+        "return": mean_return,
+        "interquartile_mean": _interval(returns, rows, config, robust=True).as_dict(),
+        "success": mean_success,
+        "ms_per_decision": float(np.median(rows["ms_per_decision"])),
+        "experience_steps": int(rows["experience_steps"].max()),
+        "share_of_optimum": None if optimum is None else mean_return["mean"] / optimum["mean_return"],
+        "regret": None if regret is None else _interval(regret, rows, config).as_dict(),
+        "metrics": metrics,
+    }
+
+
+def _exact(value: float) -> dict[str, Any]:
+    return {"mean": value, "low": None, "high": None}
+
+
+def _regret_of(rows: dict[str, np.ndarray], optimum: Optimum | None) -> np.ndarray | None:
+    """What the exact optimum gets more on the map of each episode; None where its maps are not known."""
+    known = {} if optimum is None else {entry["map_id"]: entry["return"] for entry in optimum["maps"]}
+    if not known or not all(int(name) in known for name in rows["map_id"]):
+        return None
+    return np.array([known[int(name)] for name in rows["map_id"]]) - rows["return"]
+
+
+def _regrets(
+    condition: tuple[str, ...], rows: dict[str, np.ndarray], optima: dict[str, Optimum | None]
+) -> list[dict[str, Any]]:
+    """One row per map: what the condition got, and the optimum."""
+    optimum = optima.get(rows["variant"][0])
+    if _regret_of(rows, optimum) is None or optimum is None:
+        return []
+    found = []
+    for entry in optimum["maps"]:
+        here = rows["map_id"] == entry["map_id"]
+        if here.any():
+            mean = float(rows["return"][here].mean())
+            found.append(
+                {
+                    **dict(zip(CONDITION, (str(part) for part in condition), strict=True)),
+                    "map_id": entry["map_id"],
+                    "episodes": int(here.sum()),
+                    "return": mean,
+                    "success": float((rows["outcome"][here] == "success").mean()),
+                    "optimum_return": entry["return"],
+                    "optimum_success": entry["success"],
+                    "regret": entry["return"] - mean,
+                    "share": mean / entry["return"] if entry["return"] > 0 else None,
+                }
+            )
+    return found
+
+
+def _name(condition: Sequence[str]) -> str:
+    return " / ".join(str(part) for part in condition if part)
+
+
+def _profiles(played: dict[tuple[str, ...], dict[str, np.ndarray]]) -> dict[str, Any]:
+    """Per condition the share of episodes with a return above each threshold."""
+    everything = np.concatenate([rows["return"] for rows in played.values()])
+    thresholds = np.linspace(everything.min(), everything.max(), 101)
+    return {
+        "thresholds": thresholds.tolist(),
+        "shares": {
+            _name(key): performance_profile(rows["return"], thresholds).tolist() for key, rows in played.items()
+        },
+        "episodes": {_name(key): len(rows["return"]) for key, rows in played.items()},
+        "seeds": {_name(key): len(np.unique(rows["seed"])) for key, rows in played.items()},
+    }
+
+
+def _improvements(played: dict[tuple[str, ...], dict[str, np.ndarray]], config: CompareConfig) -> list[dict[str, Any]]:
+    """P(an episode of the one beats an episode of the other) for every pair of conditions of one variant."""
+    conditions = [key for key in played if key[0] not in ORACLES]
+    return [
+        {
+            "ours": _name(ours),
+            "theirs": _name(theirs),
+            **probability_of_improvement(
+                played[ours]["return"], played[theirs]["return"], 0, config.confidence, resamples=200
+            ).as_dict(),
+        }
+        for ours in conditions
+        for theirs in conditions
+        if ours != theirs and ours[3] == theirs[3]
+    ]
+
+
+def _curve(condition: tuple[str, ...], rows: dict[str, np.ndarray], config: CompareConfig) -> dict[str, Any]:
+    """A learning curve with its band over seeds: of the policy (mean of the last 200 episodes, or a fiftieth of all)
+    and of the running average over all episodes so far.
+    """  # noqa: D205
+    seeds = np.unique(rows["seed"])
+    per_seed = [rows["return"][rows["seed"] == seed] for seed in seeds]
+    length = min(len(returns) for returns in per_seed)
+    window = min(200, max(length // 50, 1))
+    at = np.unique(np.linspace(window - 1, length - 1, min(MOST_POINTS, length)).astype(int))
+    curve: dict[str, Any] = {"name": _name(condition), "seeds": len(seeds), "episodes": length, "window": window}
+    curve["episode"] = (at + 1).tolist()
+    steps = [rows["step"][rows["seed"] == seed] for seed in seeds]
+    curve["steps"] = np.mean([taken[at] for taken in steps], axis=0).tolist()
+    for name, width in (("policy", window), ("running_average", None)):
+        lines = np.array([running_average(returns[:length], width)[at] for returns in per_seed])
+        draws = np.random.default_rng(0).integers(len(seeds), size=(500, len(seeds)))
+        means = lines[draws].mean(axis=1)
+        tail = (1 - config.confidence) / 2
+        low, high = np.quantile(means, [tail, 1 - tail], axis=0)
+        curve[name] = {"mean": lines.mean(axis=0).tolist(), "low": low.tolist(), "high": high.tolist()}
+    return curve
+
+
+def _write_tables(folder: Path, records: list[dict[str, Any]], regrets: list[dict[str, Any]]) -> None:
+    from nesy.report.text import COMPARISON_COLUMNS, comparison_rows
+
+    flat = [_flat(record) for record in records]
+    for name, rows in (("comparison", flat), ("regret", regrets)):
+        if not rows:
+            continue
+        columns = list(dict.fromkeys(column for row in rows for column in row))
+        with atomic_path(folder / f"{name}.parquet") as temporary:
+            table = pa.table({column: [row.get(column) for row in rows] for column in columns})
+            pq.write_table(table, temporary, compression="zstd")
+        with (
+            atomic_path(folder / f"{name}.csv") as temporary,
+            temporary.open("w", newline="", encoding="utf-8") as stream,
+        ):
+            writer = csv.DictWriter(stream, columns)
+            writer.writeheader()
+            writer.writerows(rows)
+    texts = comparison_rows(records)
+    with atomic_path(folder / "comparison.md") as temporary:
+        temporary.write_text(_markdown(COMPARISON_COLUMNS, texts), encoding="utf-8")
+    with atomic_path(folder / "comparison.tex") as temporary:
+        temporary.write_text(_latex(COMPARISON_COLUMNS, texts), encoding="utf-8")
+
+
+def _flat(record: dict[str, Any]) -> dict[str, Any]:
+    """A record as one row: nested figures with dotted names, the seeds as text."""
+    row: dict[str, Any] = {}
+    for name, value in record.items():
+        if isinstance(value, dict):
+            row |= {f"{name}.{inner}": figure for inner, figure in value.items()}
+        else:
+            row[name] = " ".join(map(str, value)) if isinstance(value, list) else value
+    return row
+
+
+def _markdown(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |\n" for line in lines)
+
+
+def _latex(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    special = {character: f"\\{character}" for character in "&%$#_{}"}
+    special |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+
+    def line(cells: Sequence[str]) -> str:
+        return " & ".join("".join(special.get(c, c) for c in cell) for cell in cells) + r" \\"
+
+    body = [line(columns), r"\hline", *(line(row) for row in rows)]
+    return "\n".join([rf"\begin{{tabular}}{{{'l' * 4}{'r' * (len(columns) - 4)}}}", *body, r"\end{tabular}", ""])
