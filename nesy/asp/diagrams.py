@@ -1,100 +1,93 @@
-"""Tables as decision diagrams: which values a row allows, with equal parts shared.
-
-What matters to a proof is which values are possible, and most rows of a large table agree on that. The diagram is
-reduced: no two nodes are equal, no node asks for a value that makes no difference.
-"""
+"""Tables as decision diagrams: equal parts are shared, and nothing is asked for that makes no difference."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from nesy.dbn.model import TwoSliceDBN
-from nesy.dbn.rows import unique_rows
-from nesy.errors import UserError
-
 
 @dataclass(frozen=True)
 class Diagram:
-    """The diagram of one table; nodes are numbered from 0, leaves first."""
+    """A reduced decision diagram; nodes are numbered from 0, its L leaves first."""
 
     root: int
-    leaves: np.ndarray
-    """bool [L, K]: which values each leaf allows."""
-    parents: tuple[int, ...]
-    """Position of the parent that each further node asks for."""
-    children: np.ndarray
-    """int64 [nodes, K]: where its values lead."""
-    dropped: float
-    """Largest probability that a row has on values taken as impossible."""
+    leaves: int
+    """L."""
+    axes: tuple[int, ...]
+    """The axis that each further node asks for."""
+    children: tuple[np.ndarray, ...]
+    """Where the values of that axis lead, int64 [size of the axis] for each further node."""
 
 
-def diagram(dbn: TwoSliceDBN, action: int, factor: int, least: float, rows: np.ndarray | None = None) -> Diagram:
-    """The diagram of the values at least as probable as `least`.
+def diagram(labels: np.ndarray) -> Diagram:
+    """The diagram of a table of labels.
 
     Args:
-        dbn: the model.
-        action: the action.
-        factor: the factor.
-        least: values less probable count as impossible.
-        rows: the rows that matter (the others are free to become whatever makes the diagram small); by default all.
-
-    Raises:
-        UserError: `least` makes a row impossible.
+        labels: int64 [s1, ..., sm], labels 0..L-1; -1 where any label will do (the diagram chooses what makes it
+            small).
     """
-    k = dbn.num_values
-    table = dbn.cpt(action, factor)
-    chosen = table if rows is None else table[rows]
-    allowed = chosen >= max(least, np.finfo(float).tiny)
-    if not allowed.any(axis=1).all():
-        raise UserError(f"no value of some row is at least {least} probable; choose less")
-    first, index, _ = unique_rows(allowed)
-    leaves = allowed[first]
-    nodes = np.full(len(table), -1, dtype=np.int64)
-    nodes[np.arange(len(table)) if rows is None else rows] = index
-    parents: list[int] = []
+    leaves = int(labels.max(initial=0)) + 1
+    nodes = labels.reshape(-1)
+    total = leaves
+    axes: list[int] = []
     children: list[np.ndarray] = []
-    total = len(leaves)
-    for position in range(len(dbn.parents(action, factor)) - 1, -1, -1):
-        blocks = _filled(nodes.reshape(-1, k))
+    for axis in range(labels.ndim - 1, -1, -1):
+        blocks = nodes.reshape(-1, labels.shape[axis])
+        if (nodes < 0).any():
+            # free entries of a block take its first entry that is not free
+            first = blocks[np.arange(len(blocks)), (blocks >= 0).argmax(axis=1)]
+            blocks = np.where(blocks >= 0, blocks, first[:, None])
         nodes = blocks[:, 0].copy()
         differing = np.flatnonzero((blocks != blocks[:, :1]).any(axis=1))
         if len(differing):
-            distinct, which = np.unique(blocks[differing], axis=0, return_inverse=True)
-            nodes[differing] = total + which.reshape(-1)
-            children.append(distinct)
-            parents += [position] * len(distinct)
+            distinct, which = _distinct(blocks[differing])
+            nodes[differing] = total + which
+            children += list(distinct)
+            axes += [axis] * len(distinct)
             total += len(distinct)
-    return Diagram(
-        root=max(int(nodes[0]), 0),
-        leaves=leaves,
-        parents=tuple(parents),
-        children=np.concatenate(children) if children else np.zeros((0, k), dtype=np.int64),
-        dropped=float(np.where(allowed, 0.0, chosen).sum(axis=1).max()),
-    )
+    return Diagram(max(int(nodes[0]), 0), leaves, tuple(axes), tuple(children))
 
 
-def _filled(blocks: np.ndarray) -> np.ndarray:
-    """Free entries (-1) of each block take the block's first entry that is not free."""
-    first = blocks[np.arange(len(blocks)), (blocks >= 0).argmax(axis=1)]
-    return np.where(blocks >= 0, blocks, first[:, None])
+def _distinct(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distinct rows, and for every row the number of its own."""
+    size = int(blocks.max()) + 2
+    if size ** blocks.shape[1] < 1 << 62:
+        keys = (blocks + 1) @ size ** np.arange(blocks.shape[1], dtype=np.int64)
+        _, first, which = np.unique(keys, return_index=True, return_inverse=True)
+        return blocks[first], which.reshape(-1)
+    distinct, which = np.unique(blocks, axis=0, return_inverse=True)
+    return distinct, which.reshape(-1)
 
 
-def diagram_facts(dbn: TwoSliceDBN, action: int, factor: int, found: Diagram) -> list[str]:
-    """The diagram as facts root/2, test/3, edge/3, leaf/2 and may/2; node N of factor F is the term n(F,N)."""
-    parents = dbn.parents(action, factor)
+def diagram_facts(
+    found: Diagram,
+    first: int,
+    variables: Sequence[tuple[int, int]],
+    values: Sequence[np.ndarray],
+    without: frozenset[int] = frozenset(),
+) -> list[str]:
+    """The inner nodes of a diagram as facts test/3 and edge/3.
 
-    def node(number: int) -> str:
-        return f"n({factor},{number})"
-
-    lines = [f"root({factor},{node(found.root)})."]
-    for number, values in enumerate(found.leaves):
-        lines.append(f"leaf({node(number)},{factor}).")
-        lines += [f"may({node(number)},{v})." for v in np.flatnonzero(values).tolist()]
-    for offset, (position, row) in enumerate(zip(found.parents, found.children.tolist(), strict=True)):
-        name = node(len(found.leaves) + offset)
-        where, p = parents[position]
-        lines.append(f"test({name},{p},{where}).")
-        lines += [f"edge({name},{value},{node(child)})." for value, child in enumerate(row)]
+    Args:
+        found: the diagram.
+        first: the number of its node 0 in the program.
+        variables: (slice, factor) of each axis.
+        values: the values of each axis.
+        without: nodes that need no edge to them.
+    """
+    lines = []
+    for offset, (axis, row) in enumerate(zip(found.axes, found.children, strict=True)):
+        where, factor = variables[axis]
+        name = first + found.leaves + offset
+        groups: dict[int, list[str]] = {}
+        for value, child in zip(values[axis].tolist(), row.tolist(), strict=True):
+            if child not in without:
+                groups.setdefault(child, []).append(str(value))
+        edges = " ".join(
+            f"edge({name},{v[0] if len(v) == 1 else f'({chr(59).join(v)})'},{first + child})."
+            for child, v in groups.items()
+        )
+        lines.append(f"test({name},{factor},{where}). {edges}")
     return lines

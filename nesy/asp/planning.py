@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from nesy.asp.conditions import Literal, of_factor, parse_literals
 from nesy.asp.encoding import ENCODINGS, run_encoding
 from nesy.asp.facts import LEAST, Facts, asp_name
 from nesy.asp.solver import solve
 from nesy.asp.sources import Source, read_sources
-from nesy.asp.verification import Literal, parse_literals
 from nesy.dbn.codebook import Codebook
 from nesy.dbn.inference import likely_next
 from nesy.dbn.model import TwoSliceDBN
@@ -83,13 +83,11 @@ def satisfied(literals: Sequence[Literal], codes: np.ndarray, truth: PredicateTr
     result = np.ones(len(codes), dtype=bool)
     holds, fails = truth.of(codes) if truth is not None else (None, None)
     for literal in literals:
-        if literal.predicate is not None and truth is not None and holds is not None and fails is not None:
+        if literal.predicate and truth is not None and holds is not None and fails is not None:
             column = truth.codebook.predicate_names.index(literal.predicate)
-            result &= (holds if literal.term.startswith("holds") else fails)[:, column]
-        elif literal.factor is not None:
-            value = int(literal.term.rstrip(")").rsplit(",", 1)[1])
-            same = np.asarray(codes)[:, literal.factor] == value
-            result &= same if literal.term.startswith("is(") else ~same
+            result &= (holds if literal.kind == "holds" else fails)[:, column]
+        elif literal.factor >= 0:
+            result &= of_factor(literal, codes)
     return result
 
 

@@ -1,11 +1,14 @@
 """Every yes and no of the verification, against enumeration of all codes."""
 
+from types import MappingProxyType
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nesy.asp.verification import verify
+from nesy.dbn.codebook import Codebook
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
 from tests.nesy.dbn.models import all_codes, random_dbn, transition_matrix
@@ -40,7 +43,10 @@ def test_verdicts_are_those_of_enumeration(seed):
     premise = ",".join(literal(rng, names, 3, False) for _ in range(rng.integers(0, 3)))
     conclusion = ",".join(literal(rng, names, 3, True) for _ in range(rng.integers(1, 3)))
     action = int(rng.integers(2))
-    verdict = verify(dbn, None, action, premise, conclusion)
+    with pytest.MonkeyPatch.context() as patch:
+        if seed % 2:
+            patch.setattr("nesy.asp.verification.try_steps", lambda *arguments: None)
+        verdict = verify(dbn, None, action, premise, conclusion)
     codes, matrix = all_codes(dbn), transition_matrix(dbn, action)
     breaks = [
         (tuple(codes[x]), tuple(codes[y]))
@@ -50,9 +56,69 @@ def test_verdicts_are_those_of_enumeration(seed):
     assert verdict.holds == (not breaks)
     assert verdict.dropped == 0
     if breaks:
-        # factors of slice t+1 that do not matter are -1 in the counterexample
-        first, later = verdict.code, verdict.next_code
-        assert any(a == first and all(v in (-1, w) for v, w in zip(later, b, strict=True)) for a, b in breaks)
+        assert (verdict.code, verdict.next_code) in breaks
+
+
+class Properties:
+    """Two predicates of a view of three cells, as a vocabulary."""
+
+    names = ("high", "equal")
+    meanings = MappingProxyType({"high": "the first cell is at least 2", "equal": "the first two cells are equal"})
+
+    def evaluate(self, views):
+        cells = views[:, 0]
+        return np.stack([cells[:, 0] >= 2, cells[:, 0] == cells[:, 1]], axis=1)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from(["all", "met"]), st.booleans())
+def test_verdicts_about_predicates_are_those_of_enumeration(seed, over, without_tries):
+    rng = np.random.default_rng(seed)
+    dbn = random_dbn(rng, num_factors=3, num_values=3, zeros=True, max_parents=int(rng.integers(1, 4)))
+    codes, matrix = all_codes(dbn), transition_matrix(dbn, 0)
+    met = codes[rng.random(27) < 0.6] if rng.random() < 0.9 else codes[:1]
+    met = met if len(met) else codes[:1]
+    book = Codebook.build(met[:, None].astype(np.uint8), met.astype(np.uint8), np.ones(len(met)), Properties())
+
+    def some(conclusion):
+        names = ["high", "not high", "equal", "not equal", "X2=1", "X1!=0", *(["same"] if conclusion else [])]
+        return [names[j] for j in rng.choice(len(names), size=rng.integers(conclusion, 3), replace=False)]
+
+    premise, conclusion = some(False), some(True)
+    with pytest.MonkeyPatch.context() as patch:
+        if without_tries:
+            patch.setattr("nesy.asp.verification.try_steps", lambda *arguments: None)
+        verdict = verify(dbn, book, 0, ", ".join(premise), ", ".join(conclusion), codes=over)
+    rules = {found.target: found for found in verdict.rules}
+
+    def truth(part, code, before):
+        name = part.removeprefix("not ")
+        if name in rules:
+            return bool(rules[name].applies(code[None])[0]) != part.startswith("not ")
+        return holds(part, code, before, list(dbn.factor_names))
+
+    starts = {tuple(code) for code in (met if over == "met" else codes)}
+    breaks = {
+        (tuple(codes[x]), tuple(codes[y]))
+        for x, y in zip(*np.nonzero(matrix), strict=True)
+        if tuple(codes[x]) in starts
+        and all(truth(part, codes[x], None) for part in premise)
+        and not all(truth(part, codes[y], codes[x]) for part in conclusion)
+    }
+    assert verdict.holds == (not breaks)
+    assert verdict.holds or (verdict.code, verdict.next_code) in breaks
+
+
+def test_a_proof_may_need_what_two_factors_have_in_common():
+    # X1' and X2' have the parity of X0; X3' is 3 only where their parities differ
+    parity = np.arange(4) % 2
+    copy = (parity[:, None] == parity) / 2.0
+    differ = parity[:, None] != parity
+    last = np.where(differ[..., None], np.eye(4)[3], np.eye(4)[0]).reshape(16, 4)
+    dbn = TwoSliceDBN.from_tables([[np.eye(4), copy, copy, last]], [[[0], [0], [0], []]], [[[], [], [], [1, 2]]])
+    assert verify(dbn, None, 0, "", "X3!=3").holds
+    assert verify(dbn, None, 0, "X0=1", "X3=0, X1!=2, X2!=0").holds
+    assert not verify(dbn, None, 0, "X0=1", "X1=1").holds
 
 
 def test_predicates_are_read_off_the_codes():
