@@ -209,6 +209,25 @@ class OraclePolicy(Protocol):
         ...
 
 
+class ObservationPolicy(Protocol):
+    """A policy of B robots that look at nothing but their observations, and remember."""
+
+    def actions(
+        self,
+        observation: Mapping[str, NDArray[Any]],
+        begun: NDArray[np.bool_] | None = None,
+        acted: NDArray[np.int64] | None = None,
+    ) -> NDArray[np.int64]:
+        """`[B]`: actions for the present observations, asked at every step.
+
+        Args:
+            observation: as the environment returns it.
+            begun: `[B]`, where an episode begins with this observation; None for nowhere but at the first call.
+            acted: `[B]`, what was chosen at the step before; None where that is what this policy said.
+        """
+        ...
+
+
 @dataclass(frozen=True)
 class OracleResult:
     """An exact optimum over a finite set of worlds (maps, and persons' goals), `W` of them.
@@ -312,6 +331,14 @@ class Domain(Protocol):
 
         Raises:
             DomainError: there is none, or the set of worlds is infinite or too large.
+        """
+        ...
+
+    def last_seen_follower(self, num_envs: int, variant: str = "paper", **parameters: Any) -> ObservationPolicy:
+        """A greedy follower of the person's last seen configuration, for B environments.
+
+        Raises:
+            DomainError: there is none.
         """
         ...
 

@@ -140,7 +140,7 @@ def _reference(cell: Cell, domain: Domain, seed: int) -> Agent:
     simple: dict[str, Callable[[], Agent]] = {
         "random": lambda: RandomAgent(len(domain.spec.action_names), seed),
         "greedy-follower": OracleFollower,
-        "greedy-last-seen": lambda: LastSeenFollower(domain.spec.geometry),
+        "greedy-last-seen": lambda: LastSeenFollower(domain, cell.variant),
     }
     if cell.agent in simple:
         return simple[cell.agent]()

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from domains.core import DomainSpec, OracleResult, RecordedSteps, ViewGeometry
 from domains.person_following.enumeration import all_maps, all_transitions, all_views
+from domains.person_following.experts import LastSeenFollower
 from domains.person_following.metrics import belief_metrics, episode_metrics
 from domains.person_following.predicates import ViewPredicates
 from domains.person_following.variants import VARIANTS, Parameters, parameters_of
@@ -83,6 +84,10 @@ class PersonFollowing:
         from domains.person_following.history_policies import egocentric_optimum
 
         return egocentric_optimum(*self._worlds_of(variant, parameters), discount)
+
+    def last_seen_follower(self, num_envs: int, variant: str = "paper", **parameters: Any) -> LastSeenFollower:
+        """A greedy follower of the person's last seen configuration, for B environments."""
+        return LastSeenFollower(num_envs, parameters_of(variant, **parameters))
 
     @staticmethod
     def _worlds_of(

@@ -6,6 +6,7 @@ is `env.expert_actions("goal")`. Here are those with a memory or a mixture.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from domains.core import EMPTY, FORWARD, LEFT, RIGHT, STAY, UNSEEN, WALL, ViewGe
 from domains.person_following.paths import allocate_scratch, astar
 from domains.person_following.variants import Parameters
 
-_REACH = 10
+_REACH = 10  # cells around the robot that its path search considers
 
 
 class SwitchingMixture:
@@ -35,15 +36,16 @@ class SwitchingMixture:
 class LastSeenFollower:
     """Greedy follower under partial observability: walks to the person's last seen pose, by its view alone.
 
-    It keeps that pose relative to itself by counting its own steps, plans with A* over the walls in its present
-    view, taking all else as free, and at an empty last place goes straight on, or turns left at a wall.
+    It keeps that pose relative to itself by counting its own steps, and plans with A* over the walls in its present
+    view, taking all else as free. The path must end in the person's heading: whoever arrives where a person was last
+    seen, and looks where it looked, finds it again more often than not. At an empty last pose it goes straight on,
+    or turns left at a wall. What this is worth: docs/notes/variants.md.
     """
 
     def __init__(self, num_envs: int, parameters: Parameters) -> None:
         """Begin without having seen anybody."""
         self.geometry = ViewGeometry(parameters.view_size)
         self._rest = parameters.robot_rest
-        self._rule = parameters.compare_heading
         self._pose = np.zeros((num_envs, 3), np.int64)
         self._known = np.zeros(num_envs, np.bool_)
         self._action = np.full(num_envs, STAY, np.int64)
@@ -52,10 +54,17 @@ class LastSeenFollower:
         self._scratch = allocate_scratch(2 * _REACH + 1)
 
     def actions(
-        self, observation: dict[str, NDArray[Any]], begun: NDArray[np.bool_] | None = None
+        self,
+        observation: Mapping[str, NDArray[Any]],
+        begun: NDArray[np.bool_] | None = None,
+        acted: NDArray[np.int64] | None = None,
     ) -> NDArray[np.int64]:
-        """`[B]`: actions for the present observations; `begun` marks environments in a new episode."""
-        views, configurations = observation["view"], observation["configuration"]
+        """`[B]`: actions for the present observations; see `domains.core.ObservationPolicy`."""
+        views, configurations = observation["view"], np.asarray(observation["configuration"])
+        if acted is not None:
+            self._action = np.array(acted, np.int64)
+        if self._rest:
+            self._action[self._time % self._rest == 0] = STAY
         if begun is not None:
             self._known[begun] = False
             self._action[begun] = STAY
@@ -71,8 +80,7 @@ class LastSeenFollower:
         for b in np.nonzero(self._known)[0]:
             actions[b] = self._towards(views[b], self._pose[b], bool(seen[b]), bool(self._front_free[b]))
         self._time += 1
-        resting = (self._time % self._rest == 0) if self._rest else np.zeros(len(views), np.bool_)
-        self._action = np.where(resting, STAY, actions)
+        self._action = actions.copy()
         return actions
 
     def _advance(self) -> None:
@@ -92,11 +100,9 @@ class LastSeenFollower:
         side, ahead, heading = (int(v) for v in pose)
         x = min(max(_REACH + side, 0), 2 * _REACH)
         y = min(max(_REACH - ahead, 0), 2 * _REACH)
-        compare = seen and (self._rule == "always" or (self._rule == "unless-0" and heading != 0))
-        goal_heading = heading if compare else -1
-        length = astar(grid, 0, _REACH, _REACH, 3, x, y, goal_heading, compare, self._scratch)
+        length = astar(grid, 0, _REACH, _REACH, 3, x, y, heading, True, self._scratch)
         if length > 0:
             return int(self._scratch.path[0])
-        if seen or length < 0:
+        if seen:
             return STAY
         return FORWARD if free else LEFT

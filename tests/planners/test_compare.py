@@ -59,8 +59,8 @@ def test_followers_reach_the_known_figures() -> None:
     follower = evaluate(domain, "paper", Player(OracleFollower()), 42, EVALUATION_SEED)
     assert follower["return"].mean() == pytest.approx(90.3, abs=0.7)
     assert (follower["outcome"] == 1).mean() == pytest.approx(0.807, abs=0.01)
-    last_seen = evaluate(domain, "paper", Player(LastSeenFollower(domain.spec.geometry)), 42, EVALUATION_SEED)
-    assert last_seen["return"].mean() > 85
+    last_seen = evaluate(domain, "paper", Player(LastSeenFollower(domain, "paper")), 42, EVALUATION_SEED)
+    assert last_seen["return"].mean() > 88
     assert np.unique(follower["map_id"]).size == 42
 
 
