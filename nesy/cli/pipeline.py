@@ -240,9 +240,13 @@ class Pipeline:
         """Extract the 2DBN."""
         self.run.require("collect", "train")
         if not self.run.has("extract"):
-            from nesy.dbn import extract_run
+            from nesy.dbn import extract_run, fidelity_report
 
             figures = self._timed("extract", lambda: extract_run(self.run, self.config.domain))
+            figures["fidelity"] = self._timed(
+                "fidelity",
+                lambda: fidelity_report(self.run, self.config.domain, self.config.variant, self.config.seed),
+            )
             self.run.update_summary(dbn=figures)
         return dict(self.run.read_summary()["dbn"])
 

@@ -24,6 +24,8 @@ _WHERE = {
     "extract": "nesy.dbn.extraction",
     "extract_run": "nesy.dbn.extraction",
     "fidelity": "nesy.dbn.measures",
+    "fidelity_report": "nesy.dbn.fidelity",
+    "StepTable": "nesy.dbn.step_tables",
 }
 
 __all__ = sorted(_WHERE)

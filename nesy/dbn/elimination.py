@@ -66,8 +66,8 @@ class Programs(NamedTuple):
 class _Planner:
     """Plans the sums of one model."""
 
-    def __init__(self, dbn: TwoSliceDBN) -> None:
-        self.dbn = dbn
+    def __init__(self, dbn: TwoSliceDBN, frontier: bool) -> None:
+        self.dbn, self.frontier = dbn, frontier
         self.operations: list[tuple[tuple[int, ...], tuple[int, ...], list[_Tensor], _Tensor]] = []
         self.memory = 2 * dbn.num_factors * dbn.num_values
 
@@ -76,11 +76,13 @@ class _Planner:
         dbn, n, k = self.dbn, self.dbn.num_factors, self.dbn.num_values
         pool: list[_Tensor] = []
         now: set[int] = set()
-        for i in ancestors(dbn, action, (factor,)):
+        for i in (factor,) if self.frontier else ancestors(dbn, action, (factor,)):
             axes = tuple(where * n + p for where, p in dbn.parents(action, i)) + (n + i,)
             strides = tuple(k ** (len(axes) - 1 - axis) for axis in range(len(axes)))
             pool.append(_Tensor(axes, True, int(dbn.offsets[action, i]) * k, strides))
             now |= set(dbn.parents_now[action][i])
+            if self.frontier:  # parents of slice t+1 have their marginals by now, and are taken as free of each other
+                now |= {n + p for p in dbn.parents_next[action][i]}
         pool += [_Tensor((p,), False, p * k, (1,)) for p in sorted(now)]
         target = n + factor
         out = _Tensor((target,), False, target * k, (1,))
@@ -120,16 +122,20 @@ def _scope(pool: list[_Tensor], variable: int) -> set[int]:
     return {v for tensor in pool if variable in tensor.scope for v in tensor.scope}
 
 
-def plan_updates(dbn: TwoSliceDBN) -> Programs:
+def plan_updates(dbn: TwoSliceDBN, frontier: bool = False) -> Programs:
     """Plan the marginals of every factor under every action.
+
+    Args:
+        dbn: the model.
+        frontier: take a factor's parents of slice t+1 as independent of all its other parents.
 
     Raises:
         UserError: the model is too densely connected.
     """
-    planner = _Planner(dbn)
+    planner = _Planner(dbn, frontier)
     first = [0]
     for a in range(dbn.num_actions):
-        for i in range(dbn.num_factors):
+        for i in dbn.order:
             planner.plan(a, i)
         first.append(len(planner.operations))
     operations = planner.operations

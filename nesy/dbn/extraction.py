@@ -247,8 +247,8 @@ class Transitions:
 
     def distinct(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Distinct transitions: codes uint8 [D, N], actions int64 [D], next codes uint8 [D, N], counts int64 [D]."""
-        *kinds, index = self.numbered()
-        return *kinds, np.bincount(index)
+        codes, actions, next_codes, index = self.numbered()
+        return codes, actions, next_codes, np.bincount(index)
 
     def numbered(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Distinct transitions as in `distinct`, and which of them every transition is, int64 [n]."""

@@ -210,19 +210,25 @@ def _run(programs: Programs, tables: np.ndarray, beliefs: np.ndarray, actions: n
 class FactoredUpdates:
     """Belief updates of one model, planned once."""
 
-    def __init__(self, dbn: TwoSliceDBN) -> None:
+    def __init__(self, dbn: TwoSliceDBN, frontier: bool = False) -> None:
         """Plan the updates.
+
+        Args:
+            dbn: the model.
+            frontier: the factored frontier of Murphy and Weiss (2001): parents of slice t+1 count as independent of
+                each other and of those of slice t. Many times faster where such arcs are many, and not exact then;
+                the same where there are none.
 
         Raises:
             UserError: the model is too densely connected.
         """
         self.shape = (dbn.num_factors, dbn.num_values)
         self.num_actions = dbn.num_actions
-        self._programs = plan_updates(dbn)
+        self._programs = plan_updates(dbn, frontier)
         self._tables = np.array(dbn.probabilities).reshape(-1)
 
     def predict(self, beliefs: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """Exact marginals of the next factors for many beliefs, each a product of its rows.
+        """Marginals of the next factors for many beliefs, each a product of its rows; exact unless `frontier`.
 
         Args:
             beliefs: float [B, N, K], rows sum to 1.
@@ -252,7 +258,7 @@ class FactoredUpdates:
     def filter(self, beliefs: np.ndarray, actions: np.ndarray, likelihoods: np.ndarray) -> np.ndarray:
         """Factored filter: exact prediction, projection to its marginals, then Bayes' rule factor by factor.
 
-        The factored frontier of Murphy and Weiss (2001). It agrees with `TwoSliceDBN.filter` where the next
+        The projection of Boyen and Koller (1998). It agrees with `TwoSliceDBN.filter` where the next
         factors are independent under the belief; where an observation of one factor tells about another
         through a shared parent, only the exact filter sees that. Fallback for an observation that the
         prediction holds impossible: the observation, where it says something, else the prediction.

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nesy.dbn.extraction import Conditionals
-from nesy.dbn.factored import FactoredUpdates, predict_batch
-from nesy.dbn.kernels import packed, sample_codes
+from nesy.dbn.factored import predict_batch
 from nesy.dbn.model import TwoSliceDBN
 from nesy.dbn.rows import unique_rows
 
@@ -143,42 +142,3 @@ def unknown_code_rate(dbn: TwoSliceDBN, known: np.ndarray, samples: int = 20_000
     later = dbn.sample(codes, rng.integers(dbn.num_actions, size=samples), rng)
     _, index, _ = unique_rows(np.concatenate([known, later]))
     return float(1.0 - np.isin(index[len(known) :], index[: len(known)]).mean())
-
-
-def rollout_drift(
-    dbn: TwoSliceDBN, codes: np.ndarray, rng: np.random.Generator, steps: int = 8, starts: int = 16, samples: int = 4000
-) -> dict[str, Any]:
-    """How far rollouts of marginals (factors taken as independent after each step) drift from the model.
-
-    From random known codes random plans are followed, once as a product of marginals and once by sampling
-    whole codes.
-
-    Args:
-        dbn: the model.
-        codes: uint8 [C, N], codes to start from.
-        rng: source of randomness.
-        steps: length of the plans.
-        starts: plans.
-        samples: codes drawn per plan.
-
-    Returns:
-        `total_variation`: mean over factors and plans after 1, 2, ... steps; `sampling_error`: what the same
-        figure would be, about, if there were no drift.
-    """
-    updates, tables = FactoredUpdates(dbn), packed(dbn)
-    k = dbn.num_values
-    first = codes[rng.integers(len(codes), size=starts)].astype(np.uint8)
-    plans = rng.integers(dbn.num_actions, size=(steps, starts))
-    beliefs = np.eye(k)[first]
-    drawn = np.repeat(first, samples, axis=0)
-    drift, error = [], []
-    for actions in plans:
-        beliefs = updates.predict(beliefs, actions)
-        drawn = sample_codes(tables, drawn, np.repeat(actions, samples), rng.random(drawn.shape))
-        one_hot = drawn.reshape(starts, samples, dbn.num_factors, 1) == np.arange(k)
-        frequency = one_hot.mean(axis=1)
-        drift.append(float(0.5 * np.abs(frequency - beliefs).sum(axis=2).mean()))
-        # mean absolute deviation of a frequency is about sqrt(2 p (1 - p) / (pi n))
-        spread = np.sqrt(2 * frequency * (1 - frequency) / (np.pi * samples))
-        error.append(float(0.5 * spread.sum(axis=2).mean()))
-    return {"total_variation": drift, "sampling_error": error}

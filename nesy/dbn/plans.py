@@ -53,8 +53,12 @@ def follow(
     plan: Sequence[int],
     factors: Sequence[int] | None = None,
     most: int = MAX_CODES,
+    drop: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Exact distribution over the codes that a plan can lead to.
+
+    With `drop`, branches are cut whose probability so far is at most that: every probability returned is then a
+    lower bound, and what they lack to 1 is how far the truth can be above.
 
     Args:
         dbn: the model.
@@ -63,9 +67,10 @@ def follow(
         factors: the factors asked for; only what they depend on is followed, other entries of the codes are 0.
             All by default.
         most: most codes followed at once.
+        drop: least probability of a branch, from the start of the plan; 0 keeps everything possible.
 
     Returns:
-        uint8 [M, N], each once, and their probabilities float64 [M].
+        uint8 [M, N], each once, and their probabilities float64 [M]; they sum to 1 less what was cut.
 
     Raises:
         UserError: more than `most` codes are reachable.
@@ -76,19 +81,26 @@ def follow(
     codes = np.where(keep, dbn._codes(code), 0)[None]
     weights = np.ones(1)
     for step, action in enumerate(plan):
-        codes, weights = _step(dbn, codes, weights, int(action), needed[step + 1], most)
+        codes, weights = step_codes(dbn, codes, weights, int(action), needed[step + 1], most, drop)
     return codes.astype(np.uint8), weights
 
 
-def _step(
-    dbn: TwoSliceDBN, codes: np.ndarray, weights: np.ndarray, action: int, factors: tuple[int, ...], most: int
+def step_codes(
+    dbn: TwoSliceDBN,
+    codes: np.ndarray,
+    weights: np.ndarray,
+    action: int,
+    factors: Sequence[int],
+    most: int = MAX_CODES,
+    drop: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
+    """One step of `follow`: from weighted codes int64 [M, N] to those of some factors after an action."""
     now, later = codes, np.zeros_like(codes)
     # factors of slice t are dropped as soon as nobody asks for them any more, so that codes merge early
     order = [i for i in dbn.order if i in factors]
     for position, i in enumerate(order):
         table = dbn.cpt(action, i)[dbn.rows(action, i, now, later)] * weights[:, None]
-        source, values = np.nonzero(table)
+        source, values = np.nonzero(table > drop)
         now, later, weights = now[source], later[source], table[source, values]
         later[:, i] = values
         waiting = order[position + 1 :]
