@@ -28,7 +28,7 @@ def draw_graph(dbn: TwoSliceDBN, path: Path | str, action: int | None = None) ->
     Raises:
         UserError: no such action, or an ending that is no picture format.
     """
-    _save(graph_figure(dbn, action), path)
+    save_figure(graph_figure(dbn, action), path)
 
 
 def graph_figure(dbn: TwoSliceDBN, action: int | None = None) -> Figure:
@@ -103,7 +103,7 @@ def draw_factor(dbn: TwoSliceDBN, codebook: Codebook, factor: int, path: Path | 
         else:
             axis.set_xlabel("not met", fontsize=6)
     figure.suptitle(f"Values of {dbn.factor_names[factor]}", fontsize=10)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def mean_view(views: np.ndarray) -> np.ndarray:
@@ -112,7 +112,12 @@ def mean_view(views: np.ndarray) -> np.ndarray:
     return np.asarray(palette[views].mean(axis=0))
 
 
-def _save(figure: Figure, path: Path | str) -> None:
+def save_figure(figure: Figure, path: Path | str) -> None:
+    """Write a figure as .png or .svg.
+
+    Raises:
+        UserError: another ending.
+    """
     path = Path(path)
     kind = path.suffix.lower().lstrip(".")
     if kind not in ("png", "svg"):

@@ -5,7 +5,7 @@ A section is a module with ANCHOR, TITLE and `make(run, summary) -> HTML`, made 
 
 from types import ModuleType
 
-from nesy.report.sections import belief, comparison, dbn, graph, learning, provenance, replays, world_model
+from nesy.report.sections import belief, comparison, dbn, fidelity, graph, learning, provenance, replays, world_model
 
 SECTIONS: tuple[ModuleType, ...] = (
     comparison,
@@ -15,5 +15,6 @@ SECTIONS: tuple[ModuleType, ...] = (
     world_model,
     graph,
     dbn,
+    fidelity,
     provenance,
 )
