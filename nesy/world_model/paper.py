@@ -1,8 +1,11 @@
-"""The `paper` architecture, as published (arXiv 2503.20425): docs/notes/paper-architecture.md lists the corrections.
+"""The `paper` architecture, as published (arXiv 2503.20425); docs/notes/paper-architecture.md lists the corrections.
 
-Encoder: concept embedding 5, two 3 x 3 convolutions with 4 hidden channels and self-attention over the cells
-between them, then a linear map to the N x K logits. Decoder: the mirror image with transposed convolutions.
-Action embedding 10; transition: self-attention over the factors, then a perceptron 200-200; inverse 100-100.
+encoder      concept embedding 5; 3 x 3 convolution without padding to 4 channels; self-attention over what is left
+             of the cells; a convolution over all of them to the N x K logits; ELU after both
+decoder      self-attention over the factors; for a next belief, two layers that mix in the action; two transposed
+             convolutions back to the cells; self-attention over the cells
+transition   self-attention over the factors, joined with the action's embedding of size 10; perceptron 200-200
+inverse      perceptron 100-100 from both beliefs to the action's embedding
 """
 
 from __future__ import annotations
@@ -17,28 +20,36 @@ CONCEPT, CHANNELS, ACTION = 5, 4, 10
 
 
 class _SelfAttention(nn.Module):
-    """One head of self-attention over a sequence [B, L, C], added to it.
+    """Self-attention over a sequence [B, L, C], which it replaces; with one head, or one head per channel.
 
-    What `nn.MultiheadAttention` computes, with its initial weights; written out because its fused kernel is slow
-    on the CPU for sequences as short and channels as few as here.
+    What `nn.MultiheadAttention` computes, with its initial weights; written out because its kernels take most of an
+    epoch on the CPU where sequences are as short and channels as few as here.
     """
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self, channels: int, *, head_per_channel: bool = False) -> None:
         super().__init__()
+        self.head_per_channel = head_per_channel
         self.project, self.out = nn.Linear(channels, 3 * channels), nn.Linear(channels, channels)
         nn.init.xavier_uniform_(self.project.weight)
         nn.init.zeros_(self.project.bias)
         nn.init.zeros_(self.out.bias)
-        self.scale = channels**-0.5
 
     def forward(self, sequence: Tensor) -> Tensor:
-        query, key, value = self.project(sequence).chunk(3, -1)
-        weights = torch.softmax(torch.einsum("bic,bjc->bij", query * self.scale, key), -1)
-        mixed: Tensor = self.out(torch.einsum("bij,bjc->bic", weights, value))
-        return sequence + mixed
+        size, length, channels = sequence.shape
+        parts = self.project(sequence)
+        if self.head_per_channel:
+            # Scores are products of two numbers: with all heads of the batch side by side, no matrix product is due.
+            query, key, value = parts.transpose(0, 1).reshape(length, size, 3, channels).unbind(2)
+            weights = torch.softmax(key[:, None] * query[None], 0)
+            mixed = (weights * value[:, None]).sum(0).transpose(0, 1)
+        else:
+            query, key, value = parts.chunk(3, -1)
+            mixed = torch.softmax(query @ key.transpose(1, 2) * channels**-0.5, -1) @ value
+        attended: Tensor = self.out(mixed)
+        return attended
 
 
-def _attend(attention: _SelfAttention, features: Tensor) -> Tensor:
+def _over_cells(attention: _SelfAttention, features: Tensor) -> Tensor:
     """Attention over the cells of a feature map [B, C, v, v]."""
     mixed: Tensor = attention(features.flatten(2).transpose(1, 2))
     return mixed.transpose(1, 2).reshape(features.shape)
@@ -51,39 +62,39 @@ class PaperWorldModel(WorldModel):
 
     def __init__(self, **sizes: int) -> None:
         super().__init__(**sizes)
-        cells, code = self.view_size**2, self.num_factors * self.num_values
+        inner, code = self.view_size - 2, self.num_factors * self.num_values
         self.concepts = nn.Embedding(NUM_KINDS, CONCEPT)
-        self.convolve_in = nn.Conv2d(CONCEPT, CHANNELS, 3, padding=1)
+        self.convolve_in = nn.Conv2d(CONCEPT, CHANNELS, 3)
         self.attend_in = _SelfAttention(CHANNELS)
-        self.convolve_out = nn.Conv2d(CHANNELS, CHANNELS, 3, padding=1)
-        self.to_code = nn.Linear(CHANNELS * cells, code)
-        self.from_code = nn.Linear(code, CHANNELS * cells)
-        self.deconvolve_in = nn.ConvTranspose2d(CHANNELS, CHANNELS, 3, padding=1)
-        self.attend_out = _SelfAttention(CHANNELS)
-        self.deconvolve_out = nn.ConvTranspose2d(CHANNELS, NUM_KINDS, 3, padding=1)
+        self.convolve_out = nn.Conv2d(CHANNELS, code, inner)
+        self.attend_code = _SelfAttention(self.num_values, head_per_channel=True)
+        self.with_action = nn.Sequential(nn.Linear(code + ACTION, 200), nn.ELU(), nn.Linear(200, code), nn.ELU())
+        self.deconvolve_in = nn.ConvTranspose2d(code, CHANNELS, inner)
+        self.deconvolve_out = nn.ConvTranspose2d(CHANNELS, NUM_KINDS, 3)
+        self.attend_out = _SelfAttention(NUM_KINDS)
         self.actions = nn.Embedding(self.num_actions, ACTION)
-        self.attend_factors = _SelfAttention(self.num_values)
+        self.attend_factors = _SelfAttention(self.num_values, head_per_channel=True)
         self.forward_model = nn.Sequential(
-            nn.Linear(code + ACTION, 200), nn.ReLU(), nn.Linear(200, 200), nn.ReLU(), nn.Linear(200, code)
+            nn.Linear(code + ACTION, 200), nn.ELU(), nn.Linear(200, 200), nn.ELU(), nn.Linear(200, code)
         )
         self.inverse_model = nn.Sequential(
-            nn.Linear(2 * code, 100), nn.ReLU(), nn.Linear(100, 100), nn.ReLU(), nn.Linear(100, ACTION)
+            nn.Linear(2 * code, 100), nn.ELU(), nn.Linear(100, 100), nn.ELU(), nn.Linear(100, ACTION)
         )
 
     def encode(self, views: Tensor) -> Tensor:
         """Belief logits [B, N, K] of views [B, v, v]."""
         features = self.concepts(views.long()).permute(0, 3, 1, 2)
-        features = _attend(self.attend_in, F.relu(self.convolve_in(features)))
-        logits: Tensor = self.to_code(F.relu(self.convolve_out(features)).flatten(1))
+        features = _over_cells(self.attend_in, F.elu(self.convolve_in(features)))
+        logits: Tensor = F.elu(self.convolve_out(features))
         return logits.view(len(views), self.num_factors, self.num_values)
 
-    def decode(self, belief: Tensor) -> Tensor:
-        """Cell logits [B, v, v, 4] of beliefs [B, N, K]."""
-        side = self.view_size
-        features = F.relu(self.from_code(belief.flatten(1))).view(len(belief), CHANNELS, side, side)
-        features = _attend(self.attend_out, F.relu(self.deconvolve_in(features)))
-        logits: Tensor = self.deconvolve_out(features)
-        return logits.permute(0, 2, 3, 1)
+    def decode(self, belief: Tensor, action: Tensor | None = None) -> Tensor:
+        """Cell logits [B, v, v, 4] of beliefs [B, N, K], in training those of next beliefs with the action [B]."""
+        mixed: Tensor = self.attend_code(belief).flatten(1)
+        if action is not None:
+            mixed = self.with_action(torch.cat([mixed, self.actions(action.long())], 1))
+        cells = self.deconvolve_out(self.deconvolve_in(mixed[:, :, None, None]))
+        return _over_cells(self.attend_out, cells).permute(0, 2, 3, 1)
 
     def transition_logits(self, belief: Tensor, action: Tensor) -> Tensor:
         """Logits [B, N, K] of the next belief."""

@@ -1,6 +1,6 @@
 """Training of the `paper` architecture as published: Adam decayed per epoch, Gumbel-softmax at a fixed temperature.
 
-An epoch draws 400 mini-batches from the steps as they were made, so a view counts as often as it was met.
+An epoch draws 600 mini-batches from the steps as they were made, so a view counts as often as it was met.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from nesy.config import TrainConfig
 from nesy.world_model import losses
@@ -23,8 +23,10 @@ from nesy.world_model.imagination import imagined_rollouts
 from nesy.world_model.paper import PaperWorldModel
 from nesy.world_model.symbolic_training import optimizer_tensors, restore_optimizer
 
-STEPS = 400
-"""Mini-batches of an epoch: with 500 transitions each, about the steps of 3,000 episodes in the publication."""
+STEPS = 600
+"""Mini-batches of an epoch: 300,000 transitions at 500 each, about what 3,000 episodes of the publication give."""
+CLIP = 100.0
+"""Largest norm of a gradient."""
 
 
 class PaperTrainer:
@@ -81,6 +83,7 @@ class PaperTrainer:
             parts = self._loss(self.rows[drawn])
             self.optimizer.zero_grad(set_to_none=True)
             parts["loss"].backward()
+            nn.utils.clip_grad_norm_(self.model.parameters(), CLIP)
             self.optimizer.step()
             for name, value in parts.items():
                 totals[name] = totals.get(name, torch.zeros((), device=self.device)) + value.detach() / STEPS
@@ -100,7 +103,7 @@ class PaperTrainer:
         return {"stage": "network", **{name: float(value) for name, value in totals.items()}, **figures}
 
     def _loss(self, rows: np.ndarray) -> dict[str, Tensor]:
-        """The parts of the loss on the steps `rows`."""
+        """The parts of the loss on the steps `rows`, each a mean over batch and cells or factors, as published."""
         model, columns = self.model, self.columns
         action = torch.as_tensor(columns.action[rows].astype(np.int64), device=self.device)
         # A view is met many times in a batch: each distinct one goes through the encoder once, each meeting draws
@@ -109,22 +112,31 @@ class PaperTrainer:
         met = torch.as_tensor(place, device=self.device)
         distinct = self.views[torch.as_tensor(views, device=self.device)]
         logits = model.encode(distinct)[met]
-        noisy = logits + losses.gumbel(logits.shape, self.generator, self.device)
-        sample = torch.softmax(noisy / self.config.temperature, -1)
-        before, after = sample.chunk(2)
-        predicted = model.transition(before, action)
-        observed = torch.softmax(logits, -1)[len(rows) :]
-        embedding = model.actions(action).detach()
+        before, after = self._sample(logits).chunk(2)
+        now, then = logits.chunk(2)
+        seen, seen_next = distinct[met].chunk(2)
+        expected = model.transition_logits(before, action)
+        imagined = self._sample(expected)
+        inferred = model.inferred_embedding(before, imagined)
+        decoded = model.decode(torch.cat([after, imagined]), torch.cat([action, action]))
         parts = {
-            "reconstruction": losses.reconstruction(model.decode(sample), distinct[met], self.weights),
-            "kl": losses.kl_to_uniform(logits),
-            "forward": losses.kl_to_target(predicted, observed),
-            "inverse": F.mse_loss(model.inferred_embedding(before, after), embedding),
+            "reconstruction": self._cells(model.decode(before), seen) + self._cells(decoded[: len(rows)], seen_next),
+            "kl": losses.kl_to_uniform(now) / model.num_factors,
+            "forward": losses.kl_to_target(torch.softmax(expected, -1), torch.softmax(then, -1)) / model.num_factors
+            + self._cells(decoded[len(rows) :], seen_next),
+            "inverse": F.mse_loss(inferred, model.actions(action).detach()),
         }
         parts["loss"] = (
             parts["reconstruction"] + self.config.kl_weight * parts["kl"] + parts["forward"] + parts["inverse"]
         )
         return parts
+
+    def _sample(self, logits: Tensor) -> Tensor:
+        noisy = logits + losses.gumbel(logits.shape, self.generator, self.device)
+        return torch.softmax(noisy / self.config.temperature, -1)
+
+    def _cells(self, logits: Tensor, views: Tensor) -> Tensor:
+        return F.cross_entropy(logits.flatten(0, 2), views.long().flatten(), weight=self.weights)
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Everything that the next tick depends on: tensors, and a JSON value."""
