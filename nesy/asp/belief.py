@@ -60,9 +60,12 @@ class BeliefQuestions:
         book = self.truth.codebook
         for name in predicates:
             book.predicate(name)
-        worlds = particles[unique_rows(particles)[0]]
-        holds, fails = self.truth.of(worlds)
-        lines = [f"world(0..{len(worlds) - 1})."]
+        # worlds that agree on what is asked about are one
+        holds, fails = self.truth.of(particles)
+        columns = [book.predicate_names.index(name) for name in predicates]
+        first, _, _ = unique_rows(np.concatenate([holds[:, columns], fails[:, columns]], axis=1).astype(np.uint8))
+        holds, fails = holds[first], fails[first]
+        lines = [f"world(0..{len(first) - 1})."]
         for name in predicates:
             column, constant = book.predicate_names.index(name), asp_name(name)
             lines.append(f"asked({constant}).")

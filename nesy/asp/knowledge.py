@@ -25,6 +25,7 @@ from nesy.errors import UserError
 if TYPE_CHECKING:
     from nesy.asp.constraints import Removal
     from nesy.asp.explanation import Explanation
+    from nesy.asp.planning import PredicateTruth
     from nesy.asp.shield import Shield
 
 
@@ -53,6 +54,7 @@ class KnowledgeBase:
         """A knowledge base over a model, with the views met in experience where a codebook is given."""
         self.dbn, self.codebook = dbn, codebook
         self.facts = Facts(dbn, codebook)
+        self._known_truth: PredicateTruth | None = None
 
     @classmethod
     def from_run(cls, path: Path | str) -> KnowledgeBase:
@@ -197,7 +199,8 @@ class KnowledgeBase:
         from nesy.asp.planning import find_plan
 
         started = time.perf_counter()
-        found = find_plan(self.dbn, self.codebook, np.asarray(start), goal, max_steps, **options)
+        truth = None if self.codebook is None or not len(self.codebook) else self._truth()
+        found = find_plan(self.dbn, self.codebook, np.asarray(start), goal, max_steps, truth=truth, **options)
         row = asdict(found)
         if found.actions is None:
             text = f"No plan of at most {max_steps} steps of most probable outcomes leads to [{goal}]."
@@ -206,7 +209,7 @@ class KnowledgeBase:
                 f"{len(found.actions)} steps lead to [{goal}]: {', '.join(found.actions) or 'nothing to do'}\n"
                 f"  exactly these outcomes: probability {found.path_probability:.3g}; the goal holds at the end: "
                 f"{found.goal_probability:.3g} "
-                + (f"(a row lost at most {found.dropped:.2g})" if found.exact else "(from 20,000 rollouts)")
+                + f"(and at most {found.dropped:.2g} more: outcomes left out as improbable)"
             )
         return self._finding(f"How to reach [{goal}]?", text, [row], started)
 
@@ -220,11 +223,11 @@ class KnowledgeBase:
 
         started = time.perf_counter()
         actions = [self.action(a) for a in plan]
-        found = after(self.dbn, self._book(), np.asarray(start), actions)
+        found = after(self.dbn, self._truth(), np.asarray(start), actions)
         likely = sorted(found.can.items(), key=lambda item: -item[1])[:MOST_LINES]
         text = (
             f"{found.codes} outcomes are possible "
-            f"(values below {found.least:g} left out: at most {found.dropped:.2g} of a row).\n"
+            f"(those of at most {found.cut:g} are left out, together {found.dropped:.2g}).\n"
             f"  must hold: {', '.join(found.must) or 'nothing'}\n"
             f"  can hold: {', '.join(f'{name} ({p:.3f})' for name, p in likely) or 'nothing else'}\n"
             f"  cannot hold: {len(found.cannot)} predicates"
@@ -239,10 +242,9 @@ class KnowledgeBase:
             UserError: no particles, or no such predicate.
         """
         from nesy.asp.belief import BeliefQuestions
-        from nesy.asp.planning import PredicateTruth
 
         started = time.perf_counter()
-        found = BeliefQuestions(PredicateTruth(self._book())).ask(particles, predicates)
+        found = BeliefQuestions(self._truth()).ask(particles, predicates)
         lines = []
         for name, k in found.items():
             if k.knows or k.knows_not:
@@ -374,6 +376,14 @@ class KnowledgeBase:
         if self.codebook is None or not len(self.codebook):
             raise UserError("this model has no codebook: its values have no meaning in views")
         return self.codebook
+
+    def _truth(self) -> PredicateTruth:
+        """What holds in the codes of the codebook, worked out once."""
+        from nesy.asp.planning import PredicateTruth
+
+        if self._known_truth is None:
+            self._known_truth = PredicateTruth(self._book())
+        return self._known_truth
 
     def _finding(self, question: str, text: str, rows: Sequence[dict[str, Any]], started: float) -> Finding:
         return Finding(question, text, tuple(rows), round(time.perf_counter() - started, 4))

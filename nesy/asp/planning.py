@@ -11,20 +11,21 @@ import numpy as np
 
 from nesy.asp.conditions import Literal, of_factor, parse_literals
 from nesy.asp.encoding import ENCODINGS, run_encoding
-from nesy.asp.facts import LEAST, Facts, asp_name
+from nesy.asp.facts import Facts, asp_name
 from nesy.asp.solver import solve
 from nesy.asp.sources import Source, read_sources
 from nesy.dbn.codebook import Codebook
 from nesy.dbn.inference import likely_next
 from nesy.dbn.model import TwoSliceDBN
-from nesy.dbn.plans import follow, pruned
+from nesy.dbn.plans import follow
 from nesy.dbn.rows import unique_rows
 from nesy.errors import UserError
 
 MAX_CODES = 20_000
 MAX_OUTCOMES = 50_000
 HOPE = 0.01
-SAMPLES = 20_000
+CUTS = (1e-6, 1e-5, 1e-4, 1e-3)
+"""Outcomes that are left out are at most so probable: the first that leaves few enough others."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +39,9 @@ class Plan:
     path_probability: float
     """Probability of exactly these outcomes, from the model."""
     goal_probability: float
-    """Probability that the goal holds at the end, whatever the outcomes on the way."""
-    exact: bool
-    """Whether `goal_probability` is computed; otherwise it is the share of 20,000 sampled rollouts."""
+    """Probability that the goal holds at the end, whatever the outcomes on the way: exact but for `dropped`."""
     dropped: float
-    """Values of a row below 0.001 were left out for an exact `goal_probability`: the most a row lost."""
+    """Probability of the outcomes left out as too improbable: the goal is at most so much more probable."""
     exhausted: bool
     """Without a plan: whether all plans up to the limit were searched (by most probable outcomes)."""
 
@@ -101,11 +100,14 @@ def find_plan(
     most_probable: bool = False,
     time_limit: float = 10.0,
     optimistic: bool = False,
+    any_length: bool = False,
+    truth: PredicateTruth | None = None,
 ) -> Plan:
     """The shortest plan of most probable outcomes to a goal.
 
     With `optimistic`, an action may have any outcome that is at least 0.01 probable (among the 16 most probable):
-    together with `most_probable` that is the most probable trajectory to the goal of the least length.
+    together with `most_probable` that is the most probable trajectory to the goal of the least length, and with
+    `any_length` besides the most probable one of at most `max_steps` steps.
 
     Args:
         dbn: the model.
@@ -117,6 +119,8 @@ def find_plan(
         most_probable: of the shortest plans, the one whose outcomes are most probable (instead of any).
         time_limit: seconds for each length tried, where there are rules.
         optimistic: whether outcomes other than the most probable one may be hoped for.
+        any_length: with `most_probable`, longer plans count too if their outcomes are more probable.
+        truth: what holds in the codebook's codes, if that is worked out already.
 
     Raises:
         UserError: a wrong condition or rule, or more than 20,000 codes are reachable.
@@ -124,26 +128,34 @@ def find_plan(
     literals = parse_literals(dbn, codebook, goal)
     if not literals:
         raise UserError("a plan needs a goal")
-    truth = PredicateTruth(codebook) if codebook is not None and len(codebook) else None
+    if truth is None and codebook is not None and len(codebook):
+        truth = PredicateTruth(codebook)
     codes, moves, distance = _reachable(dbn, start, max_steps, truth, optimistic)
     good = satisfied(literals, codes, truth)
     left = _steps_left(moves, good, max_steps)
     sources = read_sources(list(rules))
     first = int(distance[good].min(initial=max_steps + 1))
-    lengths = range(first, max_steps + 1)
-    for horizon in lengths if sources or first <= max_steps else ():
+    best: tuple[float, list[int], list[int]] | None = None
+    for horizon in range(first, max_steps + 1):
         useful = [m for m in moves if distance[m.source] + 1 + left[m.target] <= horizon]
-        found = _solve(dbn, codes, useful, good, horizon, sources, most_probable, truth, time_limit)
-        if found is not None:
-            actions, path = found
-            lost, goal_probability, exact = _goal_probability(dbn, start, actions, literals, truth)
-            chance = {(m.source, m.action, m.target): m.probability for m in moves}
-            steps = zip(path, actions, path[1:], strict=False)
-            probability = math.prod(chance[step] for step in steps)
-            names = tuple(dbn.action_names[a] for a in actions)
-            chain = tuple(tuple(int(v) for v in codes[c]) for c in path)
-            return Plan(names, chain, probability, goal_probability, exact, lost, True)
-    return Plan(None, (), 0.0, 0.0, True, 0.0, True)
+        layers = _Layers(len(codes), useful, good, horizon, most_probable)
+        if best is not None and layers.bound <= best[0]:
+            continue
+        found = _solve(dbn, codes, layers, sources, truth, time_limit)
+        if found is None:
+            continue
+        chance = {(m.source, m.action, m.target): m.probability for m in useful}
+        probability = math.prod(chance[step] for step in zip(found[1], found[0], found[1][1:], strict=False))
+        if best is None or probability > best[0]:
+            best = (probability, *found)
+        if not any_length:
+            break
+    if best is None:
+        return Plan(None, (), 0.0, 0.0, 0.0, True)
+    probability, actions, path = best
+    goal_probability, lost = _goal_probability(dbn, start, actions, literals, truth)
+    names = tuple(dbn.action_names[a] for a in actions)
+    return Plan(names, tuple(tuple(int(v) for v in codes[c]) for c in path), probability, goal_probability, lost, True)
 
 
 @dataclass(frozen=True)
@@ -223,24 +235,63 @@ def _outcomes(
     return [(int(b), later[b, w], float(weights[b, w])) for b, w in zip(*np.nonzero(chosen), strict=True)]
 
 
+class _Layers:
+    """The moves of each step of a plan of some length, with reduced costs.
+
+    The reduced cost of a move is its cost -1000 log p, plus the least cost from there to the goal, less the least
+    cost from where it starts: 0 along a most probable plan, and nowhere negative.
+    """
+
+    def __init__(self, codes: int, moves: Sequence[_Move], good: np.ndarray, horizon: int, weighted: bool) -> None:
+        self.horizon = horizon
+        self.source, self.action, self.target = (
+            np.array([getattr(m, name) for m in moves], dtype=np.int64) for name in ("source", "action", "target")
+        )
+        chance = np.array([m.probability for m in moves])
+        cost = -1000 * np.log(np.maximum(chance, 1e-12)) if weighted else np.zeros(len(moves))
+        rest = np.where(good, 0.0, np.inf)
+        steps = []
+        for _ in range(horizon):
+            whole = cost + rest[self.target]
+            rest = np.full(codes, np.inf)
+            np.minimum.at(rest, self.source, whole)
+            steps.append((whole, rest))
+        self.bound = math.exp(-float(rest[0]) / 1000) if len(rest) else 0.0
+        """No plan of this length has outcomes more probable than this."""
+        here = np.zeros(codes, dtype=bool)
+        here[0] = True
+        self.moves: list[tuple[np.ndarray, np.ndarray]] = []
+        """For each step the numbers of its moves, and their reduced costs."""
+        for whole, start in reversed(steps):
+            chosen = np.flatnonzero(here[self.source] & np.isfinite(whole))
+            self.moves.append((chosen, whole[chosen] - start[self.source[chosen]]))
+            here = np.zeros(codes, dtype=bool)
+            here[self.target[chosen]] = True
+
+    def facts(self, actions: Sequence[str], cheapest: bool) -> list[str]:
+        """Facts succ/4 and cost/5; only the moves without reduced cost if `cheapest`."""
+        lines = []
+        for step, (chosen, costs) in enumerate(self.moves):
+            for m, cost in zip(chosen.tolist(), costs.tolist(), strict=True):
+                if cheapest and cost > 1e-6:
+                    continue
+                move = f"{self.source[m]},{actions[self.action[m]]},{self.target[m]},{step}"
+                lines.append(f"succ({move})." + (f" cost({move},{round(cost)})." if round(cost) else ""))
+        return lines
+
+
 def _solve(
     dbn: TwoSliceDBN,
     codes: np.ndarray,
-    moves: Sequence[_Move],
-    good: np.ndarray,
-    horizon: int,
+    layers: _Layers,
     sources: list[Source],
-    most_probable: bool,
     truth: PredicateTruth | None,
     time_limit: float,
 ) -> tuple[list[int], list[int]] | None:
     facts = Facts(dbn, None)
-    lines = [f"horizon({horizon}).", "start(0)."] + [f"goal({c})." for c in np.flatnonzero(good).tolist()]
-    for m in moves:
-        lines.append(f"succ({m.source},{facts.actions[m.action]},{m.target}).")
-        if most_probable:
-            cost = round(-1000 * math.log(max(m.probability, 1e-12)))
-            lines.append(f"cost({m.source},{facts.actions[m.action]},{m.target},{cost}).")
+    horizon = layers.horizon
+    # without rules any plan along moves without reduced cost is best
+    lines = [f"horizon({horizon}).", "start(0).", *layers.facts(facts.actions, cheapest=not sources)]
     if sources and truth is not None:
         holds, _ = truth.of(codes)
         names = [asp_name(name) for name in truth.codebook.predicate_names]
@@ -249,12 +300,11 @@ def _solve(
     text = "\n".join(lines)
     if sources:
         encoding = Source("plan.lp", (ENCODINGS / "plan.lp").read_text(encoding="utf-8"))
-        answer = solve([*sources, encoding], text, (), time_limit=time_limit)
+        answer = solve([*sources, encoding], text, (), time_limit=time_limit, core_guided=True)
         atoms = [] if not answer.models else [_parse(atom) for atom in answer.models[-1]]
     else:
         atoms = [
-            (atom.name, str(atom.arguments[0]), atom.arguments[1].number)
-            for atom in run_encoding(("plan",), text, optimise=most_probable)
+            (atom.name, str(atom.arguments[0]), atom.arguments[1].number) for atom in run_encoding(("plan",), text)
         ]
     if not atoms:
         return None
@@ -271,18 +321,29 @@ def _parse(atom: str) -> tuple[str, str, int]:
 
 def _goal_probability(
     dbn: TwoSliceDBN, start: np.ndarray, plan: list[int], literals: list[Literal], truth: PredicateTruth | None
-) -> tuple[float, float, bool]:
-    """The mass dropped, the probability of the goal after a plan, and whether that is exact."""
-    model, lost = pruned(dbn, LEAST)
-    try:
-        codes, weights = follow(model, start, plan, most=MAX_OUTCOMES)
-    except UserError:
-        rng = np.random.default_rng(0)
-        drawn = np.tile(dbn._codes(start), (SAMPLES, 1))
-        for action in plan:
-            drawn = dbn.sample(drawn, action, rng)
-        return 0.0, float(satisfied(literals, drawn, truth).mean()), False
-    return lost, float(weights[satisfied(literals, codes, truth)].sum()), True
+) -> tuple[float, float]:
+    """The probability of the goal after a plan (at least), and the mass of the outcomes left out."""
+    about_factors = all(literal.factor >= 0 for literal in literals)
+    factors = sorted({literal.factor for literal in literals}) if about_factors else None
+    codes, weights, _ = _outcomes_of(dbn, start, plan, factors)
+    return float(weights[satisfied(literals, codes, truth)].sum()), max(0.0, 1.0 - float(weights.sum()))
+
+
+def _outcomes_of(
+    dbn: TwoSliceDBN, start: np.ndarray, plan: Sequence[int], factors: Sequence[int] | None = None
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Codes that a plan leads to, their exact probabilities, and up to which probability branches were cut.
+
+    Raises:
+        UserError: there are too many even of the probable ones.
+    """
+    for drop in CUTS:
+        try:
+            return (*follow(dbn, start, plan, factors, most=MAX_OUTCOMES, drop=drop), drop)
+        except UserError:
+            if drop == CUTS[-1]:
+                raise
+    raise AssertionError
 
 
 @dataclass(frozen=True)
@@ -299,39 +360,32 @@ class Aftermath:
     """Number of possible outcomes."""
     unknown: float
     """Probability of outcomes that are no code met in experience: nothing is known about their predicates."""
-    least: float
-    """Values of a row less probable than this were taken as impossible."""
+    cut: float
+    """Outcomes that are at most so probable were left out."""
     dropped: float
-    """The most that a row lost by that."""
+    """Their probability together."""
 
 
-def after(dbn: TwoSliceDBN, codebook: Codebook, start: np.ndarray, plan: Sequence[int]) -> Aftermath:
+def after(dbn: TwoSliceDBN, truth: PredicateTruth, start: np.ndarray, plan: Sequence[int]) -> Aftermath:
     """What must, can and cannot hold after a plan.
 
-    Values less probable than 0.001 are taken as impossible; where that leaves too many outcomes, those less probable
-    than 0.01, or than 0.05. The result says which, and how much a row lost by it.
+    Outcomes whose probability is at most one in a million are left out; where too many others are left, those of at
+    most one in 100,000, and so on. The result says which, and how probable they are together.
 
     Raises:
-        UserError: more than 50,000 outcomes are possible even so.
+        UserError: more than 50,000 outcomes have a probability above 0.001.
     """
-    for least in (LEAST, 10 * LEAST, 50 * LEAST):
-        model, lost = pruned(dbn, least)
-        try:
-            codes, weights = follow(model, start, plan, most=MAX_OUTCOMES)
-        except UserError:
-            if least == 50 * LEAST:
-                raise
-        else:
-            break
-    holds, fails = PredicateTruth(codebook).of(codes)
+    codes, weights, cut = _outcomes_of(dbn, start, plan)
+    holds, fails = truth.of(codes)
     known = (holds | fails).any(axis=1)
     probability = weights @ holds
     must, cannot, can = [], [], {}
-    for p, name in enumerate(codebook.predicate_names):
+    for p, name in enumerate(truth.codebook.predicate_names):
         if holds[:, p].all():
             must.append(name)
         elif fails[:, p].all():
             cannot.append(name)
         else:
             can[name] = float(probability[p])
-    return Aftermath(tuple(must), tuple(cannot), can, len(codes), float(weights[~known].sum()), least, lost)
+    dropped = max(0.0, 1.0 - float(weights.sum()))
+    return Aftermath(tuple(must), tuple(cannot), can, len(codes), float(weights[~known].sum()), cut, dropped)

@@ -60,6 +60,7 @@ def solve(
     time_limit: float = 10.0,
     memory_mb: int = 2048,
     dropped: float = 0.0,
+    core_guided: bool = False,
 ) -> Answer:
     """Ground and solve programs together with facts.
 
@@ -71,6 +72,7 @@ def solve(
         time_limit: seconds for grounding and solving together.
         memory_mb: memory of the solving process.
         dropped: handed on to the answer.
+        core_guided: whether an optimum is looked for from below (by unsatisfiable cores) instead of from above.
 
     Raises:
         UserError: the program is wrong (with file, line and column), or does not ground within its limits.
@@ -87,6 +89,7 @@ def solve(
             "models": min(models, MAX_MODELS) or MAX_MODELS,
             "time_limit": time_limit,
             "memory_mb": memory_mb,
+            "core_guided": core_guided,
         }
         lines, killed, status = _run(task, started + time_limit + 0.5)
     records = _records(lines)

@@ -1,9 +1,10 @@
 """The process that grounds and solves one program; run as a script, with limits on what it may use.
 
-Reads one JSON object from standard input: `files` (paths of program texts), `hidden` (names of predicates
-not to print unless a program has #show), `models` (how many; 0 for all), `time_limit` in seconds,
-`memory_mb`. Writes JSON lines: `{"model": [atoms], "cost": [...]}` for every model and at the end
-`{"result": ...}` or `{"error": text}`. Imports nothing of the project: it must start at once.
+Reads one JSON object from standard input: `files` (paths of program texts), `facts` (the path of another), `hidden`
+(names of predicates not to print unless a program has #show), `models` (how many; 0 for all), `time_limit` in seconds,
+`memory_mb`, `core_guided` (how an optimum is looked for). Writes JSON lines: `{"model": [atoms], "cost": [...]}` for
+every model and at the end `{"result": ...}` or `{"error": text}`. Imports nothing of the project: it must start at
+once.
 """
 
 from __future__ import annotations
@@ -46,7 +47,8 @@ def _solve(task: dict[str, Any]) -> None:
             messages.append((code.name, message))
 
     started = time.monotonic()
-    control = clingo.Control(["--opt-mode=optN", f"--models={task['models'] + 1}"], logger=log)
+    strategy = ["--opt-strategy=usc"] if task["core_guided"] else []
+    control = clingo.Control(["--opt-mode=optN", f"--models={task['models'] + 1}", *strategy], logger=log)
     has_show = False
     try:
         with ast.ProgramBuilder(control) as builder:

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from nesy.asp import KnowledgeBase
 from nesy.asp.planning import PredicateTruth, after, find_plan
-from nesy.dbn.plans import pruned
 from nesy.errors import UserError
 from tests.nesy.dbn.models import all_codes, random_dbn, transition_matrix
 from tests.nesy.dbn.toy import toy
@@ -36,12 +35,12 @@ def test_plans_are_shortest_and_their_probabilities_exact(seed):
     steps = [dbn.action_names.index(name) for name in plan.actions]
     path = np.prod([matrices[a][number[c], number[d]] for a, c, d in zip(steps, chain, chain[1:], strict=False)])
     assert plan.path_probability == pytest.approx(path)
-    model, lost = pruned(dbn, 1e-3)
     distribution = np.eye(27)[number[chain[0]]]
     for a in steps:
-        distribution = distribution @ transition_matrix(model, a)
-    assert plan.goal_probability == pytest.approx(distribution[codes[:, 1] == value].sum())
-    assert plan.dropped == pytest.approx(lost)
+        distribution = distribution @ matrices[a]
+    goal = distribution[codes[:, 1] == value].sum()
+    assert plan.goal_probability - 1e-12 <= goal <= plan.goal_probability + plan.dropped + 1e-12
+    assert plan.dropped < 0.01
 
 
 def test_most_probable_of_the_shortest_plans():
@@ -68,6 +67,29 @@ def test_the_most_probable_trajectory_may_count_on_improbable_outcomes():
     assert find_plan(dbn, None, np.array([0]), "X0=1", optimistic=True).actions is None
 
 
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_the_most_probable_trajectory_is_that_of_dynamic_programming(seed, with_rule):
+    rng = np.random.default_rng(seed)
+    dbn = random_dbn(rng, num_factors=2, num_values=3, num_actions=2, concentration=0.3)
+    codes = all_codes(dbn)
+    matrices = [transition_matrix(dbn, a) for a in range(2)]
+    usable = [np.where(matrix >= 0.01, matrix, 0.0) for matrix in matrices]
+    for matrix, certain in zip(usable, matrices, strict=True):
+        matrix[np.arange(9), certain.argmax(axis=1)] = certain.max(axis=1)
+    if with_rule:
+        usable = usable[:1]
+    start, good = int(rng.integers(9)), codes[:, 0] == 2
+    best, here = 0.0, np.eye(9)[start]
+    for _ in range(5):
+        best = max(best, here[good].max())
+        here = np.max([(here[:, None] * matrix).max(axis=0) for matrix in usable], axis=0)
+    rules = [":- do(a1,T)."] if with_rule else []
+    plan = find_plan(dbn, None, codes[start], "X0=2", 4, rules, most_probable=True, optimistic=True, any_length=True)
+    assert plan.path_probability == pytest.approx(best, rel=0.01)
+    assert (plan.actions is None) == (best == 0)
+
+
 def test_the_user_s_rules_constrain_the_plan(tmp_path):
     dbn, codebook = toy()
     start = np.array([0, 1, 0])
@@ -92,11 +114,11 @@ def test_goals_with_predicates_and_goals_that_hold_already():
 
 def test_what_holds_after_a_plan():
     dbn, codebook = toy()
-    result = after(dbn, codebook, np.array([1, 0, 1]), [0])
+    result = after(dbn, PredicateTruth(codebook), np.array([1, 0, 1]), [0])
     assert result.must == ("goal_visible",) and "wall_ahead" in result.cannot
     assert result.codes == 1 and result.unknown == 0
     # a value that no view has: nothing is known
-    assert after(dbn, codebook, np.array([0, 0, 2]), [0]).unknown == 1
+    assert after(dbn, PredicateTruth(codebook), np.array([0, 0, 2]), [0]).unknown == 1
 
 
 def test_knowledge_is_what_all_particles_agree_on():
