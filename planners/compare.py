@@ -233,7 +233,11 @@ def _episodes(config: CompareConfig, cell: Cell) -> int:
 
 def _fingerprint(config: CompareConfig, cell: Cell, seed: int) -> str:
     """What the cell's results depend on, besides the run's earlier steps."""
-    relevant: dict[str, Any] = {"cell": asdict(cell), "seed": seed, "episodes": _episodes_evaluated(config, cell)}
+    relevant: dict[str, Any] = {
+        "cell": asdict(replace(cell, policy="")),
+        "seed": seed,
+        "episodes": _episodes_evaluated(config, cell),
+    }
     if cell.agent in settings.LEARNING_AGENTS:
         relevant["dqn"] = asdict(replace(config.dqn, checkpoint_seconds=0.0))
     if cell.agent in settings.PLANNING_AGENTS:
