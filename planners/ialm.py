@@ -22,6 +22,7 @@ is written down here: not what blocks a move, when the person waits, how far is 
 from __future__ import annotations
 
 import zipfile
+import zlib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -33,6 +34,7 @@ from nesy.dbn.kernels import Packed, packed
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
 from nesy.run_folder import atomic_path, read_json, write_json
+from planners.ialm_checks import check
 from planners.motion import RelativeMotion
 from planners.tables import DecisionTable, PackedTables, pack
 
@@ -84,6 +86,8 @@ SCALARS = (
     IS_VISIBLE,
     THE_OUTCOME,
 ) = range(len(SCALARS))
+STATE_SCALARS = 5
+"""What a state holds besides the two codes: side, ahead, heading, waiting, lost."""
 FORWARD, STAY = 2, 3
 WAIT = 3
 MAX_DISTANCE = 15
@@ -144,7 +148,7 @@ class IALM:
     @property
     def state_size(self) -> int:
         """Length of a state vector: x, y, side, ahead, heading, waiting, lost."""
-        return 2 * self.num_factors + 5
+        return 2 * self.num_factors + STATE_SCALARS
 
     @cached_property
     def packed_dbn(self) -> Packed:
@@ -291,7 +295,7 @@ class IALM:
                 {part: arrays[f"motion.{part}"] for part in ("coefficients", "next_heading", "counts")},
                 int(description["window"]),
             )
-            return cls(
+            model = cls(
                 dbn=dbn,
                 motion=motion,
                 tables=tables,
@@ -303,9 +307,20 @@ class IALM:
                 view_size=int(description["view_size"]),
                 provenance=dict(description["provenance"]),
             )
+            check(model, 3 * dbn.num_factors + len(SCALARS))
+            return model
         except FileNotFoundError:
             raise UserError(f"{path}: no such file; learn the tables again (nesy compare)") from None
-        except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError) as error:
+        except (
+            OSError,
+            ValueError,
+            KeyError,
+            TypeError,
+            AttributeError,
+            zipfile.BadZipFile,
+            zlib.error,
+            EOFError,
+        ) as error:
             raise UserError(f"{path}: damaged ({type(error).__name__}: {error}); learn the tables again") from None
 
 

@@ -100,7 +100,7 @@ def _build(kind: type, value: Any, where: str) -> Any:
     names = [item.name for item in dataclasses.fields(kind)]
     unknown = sorted(set(value) - set(names))
     if unknown:
-        raise UserError(f"{where}: unknown setting '{unknown[0]}' (known: {', '.join(names)})")
+        raise UserError(f"{where}: unknown setting '{unknown[0][:80]}' (known: {', '.join(names)})")
     return kind(**{name: _convert(types_of[name], value[name], f"{where}: {name}") for name in names if name in value})
 
 
@@ -111,7 +111,7 @@ def _convert(kind: Any, value: Any, where: str) -> Any:
     if origin is Literal:
         if value in parts:
             return value
-        raise UserError(f"{where}: {value!r} is not one of {', '.join(map(repr, parts))}")
+        raise UserError(f"{where}: {_short(value)} is not one of {', '.join(map(repr, parts))}")
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in parts:
             return None
@@ -123,7 +123,12 @@ def _convert(kind: Any, value: Any, where: str) -> Any:
     if isinstance(kind, type) and isinstance(value, kind) and (kind is bool or not isinstance(value, bool)):
         return value
     expected = "a list" if origin is tuple else getattr(kind, "__name__", str(kind))
-    raise UserError(f"{where}: expected {expected}, found {value!r}")
+    raise UserError(f"{where}: expected {expected}, found {_short(value)}")
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def differences(old: Any, new: Any, prefix: str = "") -> list[str]:

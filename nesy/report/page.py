@@ -8,7 +8,10 @@ import html
 from importlib.resources import files
 from pathlib import Path
 from string import Template
+from types import ModuleType
+from typing import Any
 
+from nesy.errors import UserError
 from nesy.progress import SILENT, Progress
 from nesy.report.sections import SECTIONS
 from nesy.run_folder import RunFolder, atomic_path
@@ -31,16 +34,16 @@ def write_report(run: RunFolder, progress: Progress = SILENT) -> Path:
     with progress.task("report", len(SECTIONS)) as task:
         for section in SECTIONS:
             title = html.escape(section.TITLE)
-            body = section.make(run, summary)
+            body = section_body(section, run, summary)
             sections.append(f'<section id="{section.ANCHOR}"><h2>{title}</h2>\n{body}\n</section>')
             navigation.append(f'<a href="#{section.ANCHOR}">{title}</a>')
             task.advance()
-    made = summary["provenance"]
+    made = summary.get("provenance", {})
     templates = files("nesy.report") / "templates"
     script = "\n".join(['"use strict";', *((templates / name).read_text(encoding="utf-8") for name in SCRIPTS)])
     page = Template((templates / "page.html").read_text(encoding="utf-8")).substitute(
         title=html.escape(f"nesy run: {run.path.name}"),
-        subtitle=html.escape(f"Variant {made['variant']}, preset {made['preset']}, seed {made['seed']}."),
+        subtitle=html.escape(f"Variant {made.get('variant')}, preset {made.get('preset')}, seed {made.get('seed')}."),
         style=(templates / "style.css").read_text(encoding="utf-8"),
         navigation="\n".join(navigation),
         sections="\n".join(sections),
@@ -51,3 +54,20 @@ def write_report(run: RunFolder, progress: Progress = SILENT) -> Path:
     with atomic_path(run.report) as temporary:
         temporary.write_text(page, encoding="utf-8")
     return run.report
+
+
+def section_body(section: ModuleType, run: RunFolder, summary: dict[str, Any]) -> str:
+    """HTML of one section.
+
+    Raises:
+        UserError: what the section is made from is missing or damaged.
+    """
+    try:
+        return str(section.make(run, summary))
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        if isinstance(error, UserError):
+            raise
+        raise UserError(
+            f"{run.path}: the section '{section.TITLE}' of the report cannot be made from summary.json and the results "
+            f"({type(error).__name__}: {str(error)[:200]}); make them again with: nesy compare --run {run.path} --redo"
+        ) from error
