@@ -8,7 +8,8 @@ The planner `network` does just that with factored beliefs, as published. The pl
 distribution over codes and remembers what the own view has shown: after every step a code loses weight for every
 cell that its decoded view has otherwise than the own view had it.
 
-A belief that is certain of a code is shifted once per (code, configuration) and remembered.
+A belief that is certain of a code is shifted once per (code, configuration) and remembered. Walks from one belief
+share their beginnings, so shifting one code to all configurations costs one step per pose.
 """
 
 from __future__ import annotations
@@ -18,19 +19,18 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from domains.core import UNSEEN, ViewGeometry
+from domains.core import UNSEEN
 from nesy.errors import UserError
+from nesy.imagined_beliefs import Believed, JointRoll, roll_factored
+from nesy.walks import Levels, Trees, levels, plan, poses_along
 from nesy.world_model.codec import code_keys
 from nesy.world_model.rolling import Rollout
 from nesy.world_model.successors import Factored, PackedModel, pack
-from nesy.world_model.walks import plan_all, poses_along, remember_all
 
 INFLUENCE_MODES = ("zero", "random", "egocentric", "perspective-shift", "perfect-information")
 PLANNERS = ("table", "network")
-FORGET = 0.01
-"""Weight that a code keeps for every cell in which it contradicts what was seen."""
-BLOCK = 2048
-"""Walks rolled at once, to bound the memory that their sparse distributions take."""
+BLOCK = 512
+"""Beliefs whose trees of walks are gone through at once, to bound the memory that their distributions take."""
 
 
 class ShiftModel(Protocol):
@@ -163,7 +163,7 @@ class PerspectiveShift:
         if planner == "table" and packed is None:
             raise UserError("this world model has no tables; shift with planner 'network', or extract a 2DBN first")
         self.model = model
-        self._rollout = None if packed is None else Rollout(packed)
+        self._joint = None if packed is None else JointRoll(packed, model)
         self._keys = np.zeros(0, dtype=np.int64)
         self._memory = _Walked.nowhere(0, model.num_factors, model.num_values)
 
@@ -182,28 +182,33 @@ class PerspectiveShift:
             result.put(rows, self._memory.take(index))
         rows = np.flatnonzero((configurations > 0) & ~certain)
         if len(rows):
-            result.put(rows, self._walk(beliefs[rows], codes[rows], configurations[rows]))
+            walked = self._walk(beliefs[rows], codes[rows], np.arange(len(rows)), configurations[rows])
+            result.put(rows, walked)
         return Shift(result.beliefs, result.lengths >= 0, np.maximum(result.lengths, 0), result.codes)
+
+    def prepare(self, codes: np.ndarray) -> int:
+        """Shift certain beliefs in codes [C, N] to every configuration, to be remembered; returns how many pairs."""
+        codes = np.asarray(codes, dtype=np.uint8)
+        everywhere = np.arange(1, 4 * self.model.views(codes[:1])[0].size + 1)
+        for first in range(0, len(codes), BLOCK):
+            block = codes[first : first + BLOCK]
+            self._remembered(np.repeat(block, len(everywhere), axis=0), np.tile(everywhere, len(block)))
+        return len(codes) * len(everywhere)
 
     def imagine(self, belief: np.ndarray, configuration: int) -> ImaginedPath:
         """One walk with every belief on the way; `belief` [N, K]."""
         belief = np.asarray(belief, dtype=np.float32)
-        nowhere = ImaginedPath((), np.full((1, *belief.shape), 1.0 / self.model.num_values, np.float32), (), False)
-        if configuration <= 0:
-            return nowhere
-        views = self.model.views(belief.argmax(-1).astype(np.uint8)[None])
-        paths, lengths = plan_all(views, *self._targets(views, np.array([configuration])))
-        if lengths[0] < 0:
-            return nowhere
-        beliefs = [belief]
-        if lengths[0] > 0:
-            self._roll(belief[None], views, paths, lengths, beliefs)
-        actions = tuple(int(action) for action in paths[0, : lengths[0]])
-        return ImaginedPath(actions, np.stack(beliefs), poses_along(actions, views.shape[1]), True)
-
-    @staticmethod
-    def _targets(views: np.ndarray, configurations: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return ViewGeometry(views.shape[1]).decode(configurations)
+        if configuration > 0:
+            views = self.model.views(belief.argmax(-1).astype(np.uint8)[None])
+            trees = plan(views)
+            if trees.depth[0, configuration - 1] >= 0:
+                poses, actions = trees.way(0, configuration - 1)
+                nodes = levels(trees, np.zeros(len(poses), dtype=np.int64), np.array(poses))
+                believed = self._roll(views, belief[None], trees, nodes)
+                along = poses_along(poses, views.shape[1])
+                return ImaginedPath(tuple(actions), believed.beliefs[nodes.targets], along, True)
+        nowhere = np.full((1, *belief.shape), 1.0 / self.model.num_values, np.float32)
+        return ImaginedPath((), nowhere, (), False)
 
     def _remembered(self, codes: np.ndarray, configurations: np.ndarray) -> np.ndarray:
         """Index into the memory of each (code, configuration), which is filled where it has to be."""
@@ -212,75 +217,41 @@ class PerspectiveShift:
         known = self._keys[index] == keys if len(self._keys) else np.zeros(len(keys), dtype=bool)
         if not known.all():
             new, first = np.unique(keys[~known], return_index=True)
-            codes, configurations = codes[~known][first], configurations[~known][first]
-            walked = self._walk(np.eye(self.model.num_values, dtype=np.float32)[codes], codes, configurations)
-            order = np.argsort(np.concatenate([self._keys, new]))
+            codes = codes[~known][first]
+            _, root, row = np.unique(new >> 16, return_index=True, return_inverse=True)
+            certain = np.eye(self.model.num_values, dtype=np.float32)[codes[root]]
+            walked = self._walk(certain, codes[root], row, new & 0xFFFF)
+            order = np.argsort(np.concatenate([self._keys, new]), kind="stable")
             self._keys = np.concatenate([self._keys, new])[order]
             self._memory = self._memory.joined(walked).take(order)
             index = np.searchsorted(self._keys, keys)
         return index
 
-    def _walk(self, beliefs: np.ndarray, codes: np.ndarray, configurations: np.ndarray) -> _Walked:
-        """Walk to configurations, all of them seen; nothing is looked up."""
-        views = self.model.views(codes)
-        paths, lengths = plan_all(views, *self._targets(views, configurations))
-        result = _Walked.nowhere(len(beliefs), self.model.num_factors, self.model.num_values)
-        result.lengths[:] = lengths
-        here = np.flatnonzero(lengths == 0)
-        result.put(here, _Walked(beliefs[here], lengths[here], codes[here]))
-        # Longest first, so that the walks still under way are always the first ones.
-        order = np.argsort(-lengths, kind="stable")[: int((lengths > 0).sum())]
-        for first in range(0, len(order), BLOCK):
-            rows = order[first : first + BLOCK]
-            shifted, likeliest = self._roll(beliefs[rows], views[rows], paths[rows], lengths[rows])
-            result.put(rows, _Walked(shifted, lengths[rows], likeliest))
+    def _walk(self, beliefs: np.ndarray, codes: np.ndarray, rows: np.ndarray, configurations: np.ndarray) -> _Walked:
+        """Walk from beliefs [R, N, K] with likeliest codes [R, N] to configurations [Q], all of them seen.
+
+        `rows` int64 [Q], ascending, says from which belief; nothing is looked up.
+        """
+        result = _Walked.nowhere(len(rows), self.model.num_factors, self.model.num_values)
+        for first in range(0, len(beliefs), BLOCK):
+            block = slice(first, first + BLOCK)
+            asked = np.arange(*np.searchsorted(rows, [first, first + BLOCK]))
+            views = self.model.views(codes[block])
+            trees = plan(views)
+            row, pose = rows[asked] - first, configurations[asked] - 1
+            lengths = trees.depth[row, pose]
+            reached = np.flatnonzero(lengths >= 0)
+            if len(reached):
+                nodes = levels(trees, row[reached], pose[reached])
+                believed = self._roll(views, beliefs[block], trees, nodes)
+                ends = (believed.beliefs[nodes.targets], lengths[reached], believed.codes[nodes.targets])
+                result.put(asked[reached], _Walked(*ends))
         return result
 
-    def _roll(
-        self,
-        beliefs: np.ndarray,
-        views: np.ndarray,
-        paths: np.ndarray,
-        lengths: np.ndarray,
-        trace: list[np.ndarray] | None = None,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Beliefs and likeliest codes at the ends of walks, longest walk first; `trace` gets those of the first."""
-        if self._rollout is None:
-            beliefs = beliefs.copy()
-            for step in range(int(lengths[0])):
-                going = int((lengths > step).sum())
-                beliefs[:going] = self.model.predict(beliefs[:going], paths[:going, step])
-                if trace is not None:
-                    trace.append(beliefs[0].copy())
-            return beliefs, beliefs.argmax(-1).astype(np.uint8)
-        rollout = self._rollout
-        memory = remember_all(views, paths, lengths)
-        start, code, mass = rollout.spread(beliefs.astype(np.float64))
-        for step in range(int(lengths[0])):
-            going = int((lengths > step).sum())
-            # Starts ascend, so the entries of walks that have arrived are the last ones.
-            cut = int(np.searchsorted(start, going))
-            moved = rollout.step(start[:cut], code[:cut], mass[:cut], paths[start[:cut], step])
-            moved = self._reminded(rollout, *moved, memory[:going, step])
-            rest = (start[cut:], code[cut:], mass[cut:])
-            start, code, mass = (np.concatenate([new, old]) for new, old in zip(moved, rest, strict=True))
-            if trace is not None:
-                trace.append(rollout.marginals(start, code, mass, len(beliefs))[0])
-        best = np.lexsort((-mass, start))[np.searchsorted(start, np.arange(len(beliefs)))]
-        return rollout.marginals(start, code, mass, len(beliefs)), rollout.codes(code[best])
-
-    def _reminded(
-        self, rollout: Rollout, start: np.ndarray, code: np.ndarray, mass: np.ndarray, memory: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Weigh the codes of walks by how well their views agree with what was seen, `memory` [walks, v, v]."""
-        distinct, place = np.unique(code, return_inverse=True)
-        meant = self.model.views(rollout.codes(distinct)).reshape(len(distinct), -1)
-        seen = memory.reshape(len(memory), -1)[start]
-        wrong = ((meant[place] != seen) & (seen != UNSEEN)).sum(1)
-        least = np.full(len(memory), seen.shape[1])
-        np.minimum.at(least, start, wrong)
-        weighed = mass * FORGET ** (wrong - least[start]).astype(np.float64)
-        return rollout.pruned(start, code, weighed)
+    def _roll(self, views: np.ndarray, beliefs: np.ndarray, trees: Trees, nodes: Levels) -> Believed:
+        if self._joint is None:
+            return roll_factored(self.model, beliefs, trees, nodes)
+        return self._joint(views, beliefs, trees, nodes)
 
 
 @dataclass
@@ -341,24 +312,26 @@ class InfluenceBelief:
     """What the planner takes the other agent to believe, under an influence mode.
 
     `zero`: nothing (uniform). `random`: a code drawn anew each time. `egocentric`: what the own agent believes.
-    `perspective-shift`: Φ, uniform where the other agent is unseen or out of reach. `perfect-information`: the
-    code of the other agent's true view.
+    `perspective-shift`: Φ. `perfect-information`: the code of the other agent's true view. Under every mode the
+    belief is uniform while the other agent is unseen, and where Φ finds no way to it: modes differ in what they make
+    of an agent in view, not in when they have something to say.
     """
 
-    def __init__(self, mode: str, codec: BeliefCodec, rng: np.random.Generator) -> None:
+    def __init__(self, mode: str, codec: BeliefCodec, rng: np.random.Generator, *, even_unseen: bool = False) -> None:
         """Prepare a mode.
 
         Args:
             mode: one of `INFLUENCE_MODES`.
             codec: of the world model.
             rng: used by `random` alone.
+            even_unseen: as in the publication, do not fall back to uniform where a mode needs no sight of the agent.
 
         Raises:
             UserError: an unknown mode.
         """
         if mode not in INFLUENCE_MODES:
             raise UserError(f"unknown influence mode '{mode}'; known: {', '.join(INFLUENCE_MODES)}")
-        self.mode, self.codec, self.rng = mode, codec, rng
+        self.mode, self.codec, self.rng, self.even_unseen = mode, codec, rng, even_unseen
         self._shift: PerspectiveShift | None = None
         if mode == "perspective-shift":
             self._shift = PerspectiveShift(codec, "network" if codec.packed() is None else "table")
@@ -373,13 +346,18 @@ class InfluenceBelief:
         num_values = beliefs.shape[-1]
         if self._shift is not None:
             return self._shift(beliefs, configurations).beliefs
+        nothing = np.full_like(beliefs, 1.0 / num_values)
         if self.mode == "egocentric":
-            return beliefs.copy()
-        if self.mode == "perfect-information":
+            believed = beliefs
+        elif self.mode == "perfect-information":
             if person_views is None:
                 raise UserError("influence mode 'perfect-information' needs the other agent's true views")
-            return np.asarray(self.codec.beliefs(person_views), dtype=np.float32)
-        if self.mode == "random":
+            believed = np.asarray(self.codec.beliefs(person_views), dtype=np.float32)
+        elif self.mode == "random":
             codes = self.rng.integers(0, num_values, beliefs.shape[:-1])
-            return np.eye(num_values, dtype=np.float32)[codes]
-        return np.full_like(beliefs, 1.0 / num_values)
+            believed = np.eye(num_values, dtype=np.float32)[codes]
+        else:
+            return nothing
+        if self.even_unseen:
+            return believed.copy()
+        return np.where((np.asarray(configurations) > 0)[:, None, None], believed, nothing)

@@ -14,9 +14,9 @@ import numpy as np
 
 from domains.core import UNSEEN, WALL, Domain, DomainError, ViewGeometry
 from nesy.perspective import PerspectiveShift
+from nesy.walks import recalled
 from nesy.world_model.codec import SymbolicCodec
 from nesy.world_model.distinct import view_keys
-from nesy.world_model.walks import plan_all, remember_all
 
 
 @dataclass(frozen=True)
@@ -135,12 +135,8 @@ def _posterior(codec: SymbolicCodec, cases: Situations) -> tuple[np.ndarray, np.
 
 
 def _seen(cases: Situations) -> np.ndarray:
-    """Bool [P, v, v]: cells of the other agent's view that the own view shows; none where there is no way."""
-    vx, vy, heading = ViewGeometry(cases.own.shape[1]).decode(cases.configuration)
-    paths, lengths = plan_all(cases.own, vx, vy, heading)
-    memory = remember_all(cases.own, paths, lengths)
-    last = memory[np.arange(len(memory)), np.maximum(lengths, 1) - 1]
-    return np.asarray(last != UNSEEN)
+    """Bool [P, v, v]: cells of the other agent's view that the own view shows."""
+    return recalled(cases.own, cases.configuration - 1) != UNSEEN
 
 
 def _scores(

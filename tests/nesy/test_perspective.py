@@ -17,8 +17,8 @@ from nesy.perspective import (
     imagine,
     shift,
 )
+from nesy.walks import plan, poses_along, recalled
 from nesy.world_model import SymbolicCodec, SymbolicWorldModel
-from nesy.world_model.walks import plan_all, poses_along, remember_all
 
 GEOMETRY = ViewGeometry()
 STEPS = {0: (1, 0), 1: (0, 1), 2: (-1, 0), 3: (0, -1)}
@@ -52,27 +52,31 @@ views = st.integers(0, 2**32 - 1).map(
 @settings(max_examples=60, deadline=None)
 @given(views, st.integers(0, 4), st.integers(0, 4), st.integers(0, 3))
 def test_paths_are_shortest_and_lead_there(view: np.ndarray, vx: int, vy: int, heading: int) -> None:
-    paths, lengths = plan_all(view[None], np.array([vx]), np.array([vy]), np.array([heading]))
-    assert lengths[0] == shortest(view, (vx, vy, heading))
-    if lengths[0] >= 0:
-        poses = poses_along(tuple(int(a) for a in paths[0, : lengths[0]]), 5)
+    trees, target = plan(view[None]), int(GEOMETRY.encode(vx, vy, heading)) - 1
+    assert trees.depth[0, target] == shortest(view, (vx, vy, heading))
+    if trees.depth[0, target] >= 0:
+        way, actions = trees.way(0, target)
+        poses = poses_along(way, 5)
+        assert poses[0] == (2, 4, 3)
         assert poses[-1] == (vx, vy, heading)
-        assert all(view[x, y] in (0, 2) for x, y, _ in poses[1:] if (x, y) != (2, 4))
+        for (x, y, h), action, then in zip(poses, actions, poses[1:], strict=False):
+            ahead = (x + STEPS[h][0], y + STEPS[h][1], h)
+            assert then == ((x, y, (h - 1) % 4), (x, y, (h + 1) % 4), ahead)[action]
+            assert view[then[:2]] in (0, 2) or action != 2
 
 
 @settings(max_examples=30, deadline=None)
 @given(views, st.integers(0, 3))
 def test_memory_of_a_turn_and_of_a_step(view: np.ndarray, seed: int) -> None:
     view[2, 4] = 0
-    memory = remember_all(view[None], np.array([[2, 0, 1]]), np.array([3]))[0]
+    poses = [int(GEOMETRY.encode(2, 3, heading)) - 1 for heading in (3, 2)]
+    memory = recalled(np.repeat(view[None], 2, axis=0), np.array(poses))
     # One step ahead, the row that was v is now v + 1, and the far row is new.
     ahead = memory[0].copy()
     assert (ahead[:, 0] == 3).all()
     expected = view[:, :4].copy()
     expected[2, 3] = 0  # the viewer's own cell shows as empty
     np.testing.assert_array_equal(ahead[:, 1:], expected)
-    # A left turn and a right turn cancel out.
-    np.testing.assert_array_equal(memory[2], memory[0])
     left = memory[1]
     assert left[2, 3] == view[1, 3]  # what was to the left is now ahead
     assert left[3, 4] == view[2, 2]  # what was ahead is now to the right
@@ -203,6 +207,7 @@ def test_influence_modes() -> None:
     rng = np.random.default_rng(3)
     model, beliefs = Untrained(), certain(rng, 50)
     configurations = rng.integers(0, 101, 50)
+    configurations[::10] = 0
     true_views = rng.integers(0, 3, (50, 5, 5)).astype(np.uint8)
     for mode in INFLUENCE_MODES:
         influence = InfluenceBelief(mode, model, np.random.default_rng(4))
@@ -212,16 +217,18 @@ def test_influence_modes() -> None:
         np.testing.assert_allclose(got.sum(-1), 1.0, atol=1e-5)
         if mode == "zero":
             assert (got == np.float32(1 / 3)).all()
+        unseen = configurations == 0
+        assert unseen.any()
+        assert (got[unseen] == np.float32(1 / 3)).all()
         if mode == "random":
-            assert set(np.unique(got)) == {0.0, 1.0}
+            assert set(np.unique(got[~unseen])) == {0.0, 1.0}
             assert (got != influence(beliefs, configurations)).any()
             repeated = InfluenceBelief(mode, model, np.random.default_rng(4))(beliefs, configurations)
             np.testing.assert_array_equal(got, repeated)
         if mode == "egocentric":
-            np.testing.assert_array_equal(got, beliefs)
-            assert got is not beliefs
+            np.testing.assert_array_equal(got[~unseen], beliefs[~unseen])
         if mode == "perfect-information":
-            np.testing.assert_array_equal(got, model.beliefs(true_views))
+            np.testing.assert_array_equal(got[~unseen], model.beliefs(true_views)[~unseen])
         if mode == "perspective-shift":
             np.testing.assert_array_equal(got, shift(beliefs, configurations, model).beliefs)
     with pytest.raises(UserError, match="unknown influence mode"):

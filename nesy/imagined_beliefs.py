@@ -1,0 +1,259 @@
+"""What is believed at the ends of imagined walks: beliefs rolled from pose to pose along trees of ways.
+
+Trees are gone through level by level, all beliefs together, so that a pose is reached by one step from its parent
+however many walks lead through it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from domains.core import UNSEEN
+from nesy.compiled import njit
+from nesy.walks import Levels, Trees, recall
+from nesy.world_model.codec import code_keys
+from nesy.world_model.rolling import THRESHOLD, Rollout
+from nesy.world_model.successors import PackedModel, successors
+
+FORGET = 0.01
+"""Weight that a code keeps for every cell in which it contradicts what was seen."""
+
+
+class Believed(NamedTuple):
+    """What is believed at nodes: `beliefs` float32 [n, N, K], and the likeliest `codes` uint8 [n, N]."""
+
+    beliefs: np.ndarray
+    codes: np.ndarray
+
+
+class Forecast(Protocol):
+    """What a factored roll needs of a world model."""
+
+    def predict(self, beliefs: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """Next beliefs [B, N, K] after actions [B]."""
+        ...
+
+
+class Meaning(Protocol):
+    """What a joint roll needs of a world model."""
+
+    def views(self, codes: np.ndarray) -> np.ndarray:
+        """Decoded views uint8 [B, v, v] of codes [B, N]."""
+        ...
+
+
+def roll_factored(model: Forecast, beliefs: np.ndarray, trees: Trees, nodes: Levels) -> Believed:
+    """Roll factored beliefs float32 [R, N, K] from node to node, as published."""
+    rolled = np.empty((len(nodes.row), *beliefs.shape[1:]), dtype=np.float32)
+    rolled[: nodes.ends[1]] = beliefs[nodes.row[: nodes.ends[1]]]
+    for depth in range(1, len(nodes.ends) - 1):
+        here = slice(nodes.ends[depth], nodes.ends[depth + 1])
+        actions = trees.action[nodes.row[here], nodes.pose[here]]
+        rolled[here] = model.predict(rolled[nodes.before[here]], actions)
+    return Believed(rolled, rolled.argmax(-1).astype(np.uint8))
+
+
+class JointRoll:
+    """Rolls joint distributions over codes through a forward model's tables, reminded of what the own view shows.
+
+    A distribution is a list of codes with their mass, exact up to branches less probable than the threshold. After
+    every step a code loses weight for each cell in which the view that it means contradicts the own view.
+    Codes met are numbered; successors and views of each are looked up once and kept.
+    """
+
+    def __init__(self, packed: PackedModel, model: Meaning, threshold: float = THRESHOLD) -> None:
+        self.packed, self.model, self.threshold = packed, model, threshold
+        self._rollout = Rollout(packed, threshold)
+        self._sorted, self._number = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+        self._keys = np.zeros(0, dtype=np.int64)
+        self._digits = np.zeros((0, packed.num_factors), dtype=np.uint8)
+        self._views = np.zeros((0, 0), dtype=np.uint8)
+        self._first = np.zeros(0, dtype=np.int64)  # by code and action; -1 where not yet expanded
+        self._last = np.zeros(0, dtype=np.int64)
+        self._then, self._chance = np.zeros(0, dtype=np.int64), np.zeros(0)
+
+    def __call__(self, views: np.ndarray, beliefs: np.ndarray, trees: Trees, nodes: Levels) -> Believed:
+        """Roll beliefs [R, N, K] over own views uint8 [R, v, v] from node to node."""
+        views = np.ascontiguousarray(views)
+        num_factors, num_values = self.packed.num_factors, self.packed.num_values
+        found = Believed(
+            np.zeros((len(nodes.row), num_factors, num_values), dtype=np.float32),
+            np.zeros((len(nodes.row), num_factors), dtype=np.uint8),
+        )
+        roots = nodes.row[: nodes.ends[1]]
+        start, key, mass = self._rollout.spread(beliefs[roots].astype(np.float64))
+        code, ends = self._numbers(key), np.searchsorted(start, np.arange(len(roots) + 1))
+        self._put(found, 0, ends, code, mass)
+        found.beliefs[: len(roots)] = beliefs[roots]
+        for depth in range(1, len(nodes.ends) - 1):
+            first, last = nodes.ends[depth], nodes.ends[depth + 1]
+            row, pose = nodes.row[first:last], nodes.pose[first:last]
+            before, action = nodes.before[first:last] - nodes.ends[depth - 1], trees.action[row, pose]
+            self._expand(before, action, ends, code)
+            ends, code, mass = _step(
+                views, row, pose, before, action, ends, code, mass, self._first, self._last, self._then,
+                self._chance, self._views, self.packed.num_actions, self.threshold, FORGET,
+            )  # fmt: skip
+            self._put(found, first, ends, code, mass)
+        return found
+
+    def _put(self, found: Believed, first: int, ends: np.ndarray, code: np.ndarray, mass: np.ndarray) -> None:
+        """Marginals and likeliest codes of distributions, from node `first` on."""
+        _summarise(ends, code, mass, self._digits, found.beliefs[first:], found.codes[first:], self._keys)
+
+    def _expand(self, before: np.ndarray, action: np.ndarray, ends: np.ndarray, code: np.ndarray) -> None:
+        """Look up the successors of all codes and actions that are about to be taken, and the views of those."""
+        size = self.packed.num_actions
+        wanted = _unexpanded(before, action, ends, code, self._first, size)
+        if not len(wanted):
+            return
+        codes = self._rollout.codes(self._keys[wanted // size])
+        cuts, then, chance = successors(self.packed, codes, wanted % size, self.threshold)
+        number = self._numbers(code_keys(then, self.packed.num_values))
+        self._first[wanted], self._last[wanted] = cuts[:-1] + len(self._then), cuts[1:] + len(self._then)
+        self._then, self._chance = np.concatenate([self._then, number]), np.concatenate([self._chance, chance])
+
+    def _numbers(self, keys: np.ndarray) -> np.ndarray:
+        """The numbers of code keys; new ones are numbered and decoded."""
+        distinct, place = np.unique(keys, return_inverse=True)
+        new = distinct[~np.isin(distinct, self._sorted, assume_unique=True)]
+        if len(new):
+            digits = self._rollout.codes(new)
+            views = self.model.views(digits).reshape(len(new), -1)
+            self._digits = np.concatenate([self._digits, digits])
+            self._views = np.concatenate([self._views.reshape(len(self._keys), views.shape[1]), views])
+            room = np.full(len(new) * self.packed.num_actions, -1, dtype=np.int64)
+            self._first, self._last = np.concatenate([self._first, room]), np.concatenate([self._last, room])
+            every = np.concatenate([self._sorted, new])
+            number = np.concatenate([self._number, len(self._keys) + np.arange(len(new))])
+            order = np.argsort(every)
+            self._sorted, self._number = every[order], number[order]
+            self._keys = np.concatenate([self._keys, new])
+        return self._number[np.searchsorted(self._sorted, distinct)][place]
+
+
+@njit(cache=True)
+def _unexpanded(
+    before: np.ndarray, action: np.ndarray, ends: np.ndarray, code: np.ndarray, first: np.ndarray, num_actions: int
+) -> np.ndarray:
+    """Numbers `code * A + action` that have no successors yet, each once."""
+    marked = np.zeros(len(first), dtype=np.bool_)
+    wanted = np.empty(len(first), dtype=np.int64)
+    count = 0
+    for node in range(len(before)):
+        for entry in range(ends[before[node]], ends[before[node] + 1]):
+            place = code[entry] * num_actions + action[node]
+            if first[place] < 0 and not marked[place]:
+                marked[place] = True
+                wanted[count] = place
+                count += 1
+    return wanted[:count].copy()
+
+
+@njit(cache=True)
+def _step(
+    views: np.ndarray,
+    row: np.ndarray,
+    pose: np.ndarray,
+    before: np.ndarray,
+    action: np.ndarray,
+    ends: np.ndarray,
+    code: np.ndarray,
+    mass: np.ndarray,
+    first: np.ndarray,
+    last: np.ndarray,
+    then: np.ndarray,
+    chance: np.ndarray,
+    meant: np.ndarray,
+    num_actions: int,
+    threshold: float,
+    forget: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One step of the distributions of all nodes of a level: their ends, codes and mass."""
+    cells = meant.shape[1]
+    seen = np.empty(cells, dtype=np.uint8)
+    total_of = np.zeros(len(meant))
+    touched = np.empty(len(meant), dtype=np.int64)
+    wrong = np.empty(len(meant), dtype=np.int64)
+    new_ends = np.zeros(len(row) + 1, dtype=np.int64)
+    room = 16 * len(row) + 16
+    new_code, new_mass = np.empty(room, dtype=np.int64), np.empty(room)
+    for node in range(len(row)):
+        count = 0
+        for entry in range(ends[before[node]], ends[before[node] + 1]):
+            place = code[entry] * num_actions + action[node]
+            for successor in range(first[place], last[place]):
+                number = then[successor]
+                if total_of[number] == 0.0:
+                    touched[count] = number
+                    count += 1
+                total_of[number] += mass[entry] * chance[successor]
+        count = _prune(touched, count, total_of, threshold)
+        recall(views[row[node]], pose[node], seen)
+        least = cells
+        for place in range(count):
+            number, errors = touched[place], 0
+            for cell in range(cells):
+                if seen[cell] != UNSEEN and seen[cell] != meant[number, cell]:
+                    errors += 1
+            wrong[place] = errors
+            least = min(least, errors)
+        for place in range(count):
+            total_of[touched[place]] *= forget ** (wrong[place] - least)
+        count = _prune(touched, count, total_of, threshold)
+        if new_ends[node] + count > room:
+            room = 2 * (new_ends[node] + count)
+            grown_code, grown_mass = np.empty(room, dtype=np.int64), np.empty(room)
+            grown_code[: new_ends[node]] = new_code[: new_ends[node]]
+            grown_mass[: new_ends[node]] = new_mass[: new_ends[node]]
+            new_code, new_mass = grown_code, grown_mass
+        for place in range(count):
+            new_code[new_ends[node] + place] = touched[place]
+            new_mass[new_ends[node] + place] = total_of[touched[place]]
+            total_of[touched[place]] = 0.0
+        new_ends[node + 1] = new_ends[node] + count
+    return new_ends, new_code[: new_ends[-1]], new_mass[: new_ends[-1]]
+
+
+@njit(cache=True)
+def _prune(touched: np.ndarray, count: int, mass: np.ndarray, threshold: float) -> int:
+    """Drop the least probable of the codes `touched[:count]` (never the likeliest), rescale to 1; how many are left."""
+    total, peak = 0.0, 0.0
+    for place in range(count):
+        total += mass[touched[place]]
+        peak = max(peak, mass[touched[place]])
+    kept, left = 0, 0.0
+    for place in range(count):
+        number = touched[place]
+        if mass[number] > threshold * total or mass[number] == peak:
+            touched[kept] = number
+            kept += 1
+            left += mass[number]
+        else:
+            mass[number] = 0.0
+    for place in range(kept):
+        mass[touched[place]] /= left
+    return kept
+
+
+@njit(cache=True)
+def _summarise(
+    ends: np.ndarray,
+    code: np.ndarray,
+    mass: np.ndarray,
+    digits: np.ndarray,
+    beliefs: np.ndarray,
+    likeliest: np.ndarray,
+    keys: np.ndarray,
+) -> None:
+    """Marginals [n, N, K] and likeliest codes [n, N] of distributions; of equals, the code of the lowest key."""
+    for node in range(len(ends) - 1):
+        best = ends[node]
+        for entry in range(ends[node], ends[node + 1]):
+            if mass[entry] > mass[best] or (mass[entry] == mass[best] and keys[code[entry]] < keys[code[best]]):
+                best = entry
+            for factor in range(digits.shape[1]):
+                beliefs[node, factor, digits[code[entry], factor]] += mass[entry]
+        likeliest[node] = digits[code[best]]
