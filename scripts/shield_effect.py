@@ -110,7 +110,7 @@ def main() -> None:
     def play(name: str, agent: Agent, shielded: bool, least_steps: int, episodes: int) -> None:
         perception = Perception(codec, options.influence, np.random.default_rng([options.seed, 1]))
         player = Watched(Player(agent, perception, mask if shielded else None), domain)
-        parts = []
+        parts: list[dict[str, np.ndarray]] = []
         while player.watch.steps < least_steps or 168 * len(parts) < episodes:
             parts.append(evaluate(domain, "paper", player, 168, options.seed + len(parts)))
         gains = np.concatenate([part["return"] for part in parts])
