@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from domains.core import GOAL, DomainError, ViewGeometry
+from domains.core import EMPTY, GOAL, DomainError, ViewGeometry
 from domains.person_following import episodes
 from domains.person_following import rules as kernel
 from domains.person_following.random_numbers import seeded_stream
@@ -225,7 +225,7 @@ class Batch:
     def state(self, index: int) -> dict[str, Any]:
         """The full state of one environment, as plain numbers and a copy of the grid."""
         robot, person = self.world.robot[index], self.world.person[index]
-        state = {
+        state: dict[str, Any] = {
             "grid": self.world.grid[index].copy(),
             "agent": (int(robot[X]), int(robot[Y]), int(robot[HEADING])),
             "person": (int(person[X]), int(person[Y]), int(person[HEADING])),
@@ -234,6 +234,9 @@ class Batch:
             "lost": int(robot[LOST]),
             "t": int(robot[TIME]),
         }
+        if self.task == "following":
+            # The person takes the place of whatever is on its cell.
+            state["grid"][state["person"][:2]] = EMPTY
         if self.parameters.num_goals > 1:
             goals = self.world.goals[index, : self.parameters.num_goals].tolist()
             state["goals"] = [(x, y) for x, y in goals]

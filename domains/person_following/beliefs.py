@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from domains.core import FORWARD, STAY
+from domains.core import EMPTY, FORWARD, GOAL, STAY
 from domains.person_following.dynamic_programming import step_tables
 from domains.person_following.oracles import state_shape, sweep
 from domains.person_following.person_chain import PersonChain, pose_views
@@ -96,12 +96,36 @@ class Worlds:
         self.at_goal = np.concatenate([chain.at_goal for chain in chains])
         self.enters = np.concatenate([t.enters for t in tables], axis=1)
         self.moved_at = np.array([chain.moved_at for chain in chains])
-        views = np.concatenate([pose_views(chain, parameters) for chain in chains], axis=1)
-        flat = views.reshape(-1, parameters.view_size**2)
+        self._number_views()
+        self.solved = [self._solve(chain) for chain in chains]
+
+    def _number_views(self) -> None:
+        """Number the distinct views, and lay out which of them each robot pose has of each person state."""
+        rules = self.parameters
+        alone = np.concatenate([pose_views(chain, rules) for chain in self.chains], axis=1)
+        # A person seen on a goal hides it, so such views are numbered of their own.
+        places, hidden = [], []
+        for base, first, chain in zip(self.table_base, self.pose_base, self.chains, strict=True):
+            poses = len(chain.poses)
+            grids = np.stack([chain.grid, chain.grid_after])
+            on_goal = grids[:, chain.person[:, 0], chain.person[:, 1]] == GOAL
+            moved, p, c = np.nonzero(on_goal[:, :, None] & (chain.configuration > 0))
+            where = (chain.configuration[p, c] - 1) // 4
+            views = alone[moved, first + c].reshape(len(c), -1)
+            views[np.arange(len(c)), where] = EMPTY
+            hidden.append(views)
+            places.append(moved * len(self.reward) + base + p * poses + c)
+        flat = np.concatenate([alone.reshape(-1, rules.view_size**2), *hidden])
         distinct, number = np.unique(flat, axis=0, return_inverse=True)
         self._number_of_view = {view.tobytes(): k for k, view in enumerate(distinct)}
-        self.view_number = number.reshape(views.shape[:2])
-        self.solved = [self._solve(chain) for chain in chains]
+        count = alone.shape[1]
+        shown = number[: 2 * count].reshape(2, count)
+        by_pose = [
+            np.tile(shown[:, first : first + len(chain.poses)], (1, len(chain.person)))
+            for first, chain in zip(self.pose_base, self.chains, strict=True)
+        ]
+        self.view_number = np.concatenate(by_pose, axis=1).astype(np.int32)  # [2, table]: before and after the move
+        self.view_number.reshape(-1)[np.concatenate(places)] = number[2 * count :]
 
     def _solve(self, chain: PersonChain) -> Solved:
         steps = min(KEPT_STEPS, self.parameters.max_steps)
@@ -198,9 +222,9 @@ class Worlds:
             return []
         i, p, _, c, _, _ = particles.T.astype(np.int64)
         moved = (t >= self.moved_at[i]).astype(np.int64)
-        seen = self.view_number[moved, self.pose_base[i] + c]
-        configuration = self.configuration[self.table_base[i] + p * self.num_poses[i] + c]
-        label = seen * _LABELS_OF_VIEW + configuration
+        place = self.table_base[i] + p * self.num_poses[i] + c
+        seen, configuration = self.view_number[moved, place], self.configuration[place]
+        label = seen.astype(np.int64) * _LABELS_OF_VIEW + configuration
         order = np.lexsort((*particles.T[::-1], label))
         particles, weights, label = particles[order], weights[order], label[order]
         bounds = np.concatenate([[0], np.nonzero(np.diff(label))[0] + 1, [len(label)]])

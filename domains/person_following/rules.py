@@ -29,7 +29,7 @@ from domains.person_following.variants import (
     R_ROBOT_REST,
     R_SEE_THROUGH,
 )
-from domains.person_following.views import configuration_of, look, relative
+from domains.person_following.views import configuration_of, look, relative, remove_person
 from domains.person_following.world import (
     AT_GOAL,
     GOAL_X,
@@ -229,6 +229,8 @@ def step_batch(rules, world, store, actions, out):  # type: ignore[no-untyped-de
         if world.others.shape[1] > 0:
             move_others(world, store)
         _configure(see_through, robot, person, views, configurations)
+        for b in range(actions.shape[0]):
+            remove_person(views, b, configurations[b])
         _measure(store, grid, robot, person, out.distance)
         _judge(rules, robot, person, out)
         describe_batch(rules, world, out.final_person_view, out.final_pose, out.final_counters)

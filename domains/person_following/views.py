@@ -84,3 +84,12 @@ def configuration_of(views, i, side, ahead, heading, see_through_walls):  # type
     if not see_through_walls and views[i, vx, vy] == UNSEEN:
         return 0
     return 1 + (vx * width + vy) * 4 + heading
+
+
+@inner
+def remove_person(views, i, configuration):  # type: ignore[no-untyped-def]
+    """Show the cell of a person seen in `views[i]` as empty: it hides the goal that it stands on."""
+    if configuration > 0:
+        width = views.shape[1]
+        place = (configuration - 1) >> 2
+        views[i, place // width, place % width] = EMPTY

@@ -34,7 +34,7 @@ X, Y, HEADING, LOST, TIME, SLOT, EPISODE, AT_GOAL, ROBOT_COLUMNS = range(9)
 class World(NamedTuple):
     """The state of B environments."""
 
-    grid: NDArray[np.uint8]  # [B, size, size]: cell kinds, the person's own cell freed
+    grid: NDArray[np.uint8]  # [B, size, size]: cell kinds, the cell freed where the person started
     robot: NDArray[np.int32]  # [B, ROBOT_COLUMNS]: see above
     person: NDArray[np.int32]  # [B, PERSON_COLUMNS]
     plan: NDArray[np.int8]  # [B, longest plan]: the person's actions

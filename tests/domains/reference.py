@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import heapq
 
-import numpy as np
-
 STEPS = {0: (1, 0), 1: (0, 1), 2: (-1, 0), 3: (0, -1)}
 LEFT, RIGHT, FORWARD, STAY = 0, 1, 2, 3
 
@@ -162,8 +160,14 @@ class Reference:
             return 0
         return 1 + (vx * self.view_size + vy) * 4 + heading
 
+    def shown(self):
+        """The grid without the person, whose own cell is empty whatever it stands on."""
+        grid = [column[:] for column in self.grid]
+        grid[self.person[0]][self.person[1]] = 0
+        return grid
+
     def observe(self):
-        return view_of(self.grid, self.agent, self.view_size, self.see_through_walls), self.configuration()
+        return view_of(self.shown(), self.agent, self.view_size, self.see_through_walls), self.configuration()
 
     def person_view(self):
         return view_of(self.grid, self.person, self.view_size, self.see_through_walls)
@@ -296,8 +300,3 @@ class Reference:
         if self.goal_moves_at and self.believed != self.goal and self.person_sees(self.believed):
             self.believed = self.goal
             self.plan = []
-
-
-def plain_grid(kernel_grid):
-    """A grid array as nested lists of ints."""
-    return np.asarray(kernel_grid).tolist()

@@ -103,6 +103,7 @@ def test_belief_steps_equal_the_environment(variant, changes):
             assert (len(successor.beliefs) == 0) == bool(last.ended[i])
             beliefs[i] = successor.beliefs[0] if successor.beliefs else None
             if successor.beliefs:
+                assert successor.labels == [worlds.label(last.robot_view[i], last.configuration[i])]
                 _, p, w, c, _, lost = successor.beliefs[0].particles[0].tolist()
                 chain = worlds.chains[i]
                 assert chain.person[p].tolist() == env.batch.world.person[i, :3].tolist()
@@ -137,6 +138,83 @@ def test_presets_make_mind_reading_pay():
     assert belief["bayes"]["return"] - belief["egocentric"]["return"] > 0.1 * belief["full_state"]["return"]
 
 
+_SMALL = {"size": 7, "num_crossings": 1, "goal_moves_at": 2, "max_steps": 30}
+
+
+@pytest.fixture(scope="module")
+def small_optima():
+    domain = load_domain()
+    optima = {name: getattr(domain, name)("false_belief", 0.95, **_SMALL) for name in _OPTIMA}
+    return domain, optima
+
+
+_OPTIMA = ("optimum", "bayes_optimum", "egocentric_optimum")
+
+
+def test_less_knowledge_is_worth_less(small_optima):
+    _, optima = small_optima
+    full, bayes, egocentric = (optima[name] for name in _OPTIMA)
+    assert full.value >= bayes.value - 0.02
+    assert bayes.value >= egocentric.value - 0.02
+    assert (bayes.map_return != egocentric.map_return).any()
+    for result in (full, bayes, egocentric):
+        assert result.value == pytest.approx(result.map_value @ result.weights)
+        assert result.mean_return == pytest.approx(result.map_return @ result.weights)
+        assert result.success == pytest.approx(result.map_success @ result.weights)
+
+
+@pytest.mark.parametrize("name", _OPTIMA)
+def test_policies_earn_in_the_environment_what_the_oracles_promise(small_optima, name):
+    """Environments with drawn goals and automatic resets: each episode brings its own world's figure."""
+    domain, optima = small_optima
+    result = optima[name]
+    env = domain.make("following", 12, "false_belief", seed=1, **_SMALL)
+    env.reset()
+    grids, _ = domain.maps("false_belief", **_SMALL)
+    env_of_world = domain.make("following", 2 * len(grids), "false_belief", seed=0, **_SMALL)
+    env_of_world.batch.begin_worlds(np.repeat(grids, 2, axis=0), np.tile([0, 1], len(grids)))
+    worlds = {(int(m), state["goal"]): i for i, (m, state) in enumerate(
+        zip(env_of_world.map_ids(), env_of_world.states(), strict=True))}  # fmt: skip
+    playing = [worlds[int(m), state["goal"]] for m, state in zip(env.map_ids(), env.states(), strict=True)]
+    returns, episodes = np.zeros(12), 0
+    for _ in range(60):
+        _, reward, terminated, truncated, infos = env.step(result.actions(env))
+        returns += reward
+        for b in np.nonzero(terminated | truncated)[0]:
+            assert returns[b] == pytest.approx(result.map_return[playing[b]])
+            assert (infos["outcome"][b] == "success") == (result.map_success[playing[b]] == 1)
+            state = env.states()[b]
+            playing[b], returns[b] = worlds[int(env.map_ids()[b]), state["goal"]], 0.0
+            episodes += 1
+    assert episodes > 30
+
+
+def test_policies_that_remember_must_be_asked_at_every_step(small_optima):
+    domain, optima = small_optima
+    policy = optima["bayes_optimum"]
+    env = domain.make("following", 3, "false_belief", seed=2, **_SMALL)
+    env.reset()
+    first = policy.actions(env)
+    assert (policy.actions(env) == first).all()
+    env.step(np.full(3, 3))  # somebody else acts: that is noticed, and no mistake
+    policy.actions(env)
+    env.step(np.full(3, 3))
+    env.step(np.full(3, 3))
+    with pytest.raises(DomainError, match="every step"):
+        policy.actions(env)
+    with pytest.raises(DomainError, match="parameters"):
+        policy.actions(domain.make("following", 3, "false_belief", seed=2))
+
+
+def test_nobody_is_mistaken_where_no_goal_moves():
+    domain = load_domain()
+    changes = {"size": 7, "num_crossings": 1, "max_steps": 30, "num_goals": 2}
+    assert (
+        domain.egocentric_optimum("intent", **changes).map_return
+        == domain.bayes_optimum("intent", **changes).map_return
+    ).all()
+
+
 def test_egocentric_agent_is_optimal_where_nobody_is_mistaken():
     worlds = _worlds("intent", size=7, num_crossings=1, max_steps=40, max_lost=5, num_goals=2)
     result = egocentric_full_state(worlds)
@@ -157,8 +235,13 @@ def test_oracles_refuse_what_they_do_not_cover():
         domain.maps(size=31, num_crossings=14)
     with pytest.raises(DomainError, match="too many"):
         domain.maps(size=31, num_crossings=28)
-    with pytest.raises(DomainError, match="discount"):
-        domain.optimum(discount=1.5)
+    for oracle in (domain.optimum, domain.bayes_optimum):
+        with pytest.raises(DomainError, match="discount"):
+            oracle(discount=1.5)
+        with pytest.raises(DomainError, match=r"51,520 worlds .* too many .* size=9"):
+            oracle("occluded")
+    with pytest.raises(DomainError, match="egocentric"):
+        domain.egocentric_optimum("false_belief", size=7, num_crossings=1, turns_at_goal=True)
     with pytest.raises(DomainError, match="egocentric"):
         egocentric_full_state(_worlds("occluded", size=5, num_crossings=1))
 
