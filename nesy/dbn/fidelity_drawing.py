@@ -61,7 +61,7 @@ def _rollouts(axis: Axes, rollouts: dict[str, Any]) -> None:
         axis.fill_between(rollouts["steps"], low, high, color=colour, alpha=0.25, linewidth=0)
         axis.plot(rollouts["steps"], low, "o-", color=colour, markersize=3.5, label=label)
     axis.set_ylim(-0.02, 1.02)
-    axis.set_title("Product-of-marginals rollouts against exact ones", fontsize=10)
+    axis.set_title("Rollouts of marginals against exact ones", fontsize=10)
     axis.set_xlabel("steps; band: what the cut branches leave open", fontsize=8)
     axis.set_ylabel("total variation")
     axis.legend(fontsize=8, frameon=False, loc="lower right")
@@ -78,7 +78,7 @@ def _plans(axis: Axes, plans: dict[str, Any]) -> None:
         values += [figures["found"], figures["valid"], figures["exhausted"]]
         colours += [colour] * 3
     _bars(axis, names, values, colours, "{:.0%}")
-    axis.set_title(f"Plans between {plans['asked']} pairs of views, executed on the real map", fontsize=10)
+    axis.set_title(f"Plans for {plans['asked']} pairs of views, executed", fontsize=10)
 
 
 def _impossible(axis: Axes, impossible: dict[str, Any]) -> None:

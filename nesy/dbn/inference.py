@@ -107,6 +107,8 @@ def plan_marginals(
     Raises:
         UserError: a wrong shape or action, or a model too densely connected for exact inference.
     """
+    from nesy.dbn.plans import reachable_values
+
     n, k = dbn.num_factors, dbn.num_values
     start = np.asarray(start)
     belief = check_belief(dbn, np.eye(k)[dbn._codes(start)] if start.ndim == 1 else start)
@@ -120,18 +122,22 @@ def plan_marginals(
         needed[step] = set(ancestors(dbn, plan[step - 1], tuple(needed[step])))
         needed[step - 1] |= {p for i in needed[step] for p in dbn.parents_now[plan[step - 1]][i]}
     # values that the start rules out are cut away: from a code, slice 0 disappears altogether
-    full = np.arange(k)
-    supports = [np.flatnonzero(row) for row in belief]
-    potentials: list[Potential] = [((i,), belief[i][supports[i]]) for i in sorted(needed[0])]
+    values = reachable_values(dbn, belief, plan)
+    for (step, factor), value in evidence.items():
+        values[step] = tuple(np.intersect1d(v, [value]) if i == factor else v for i, v in enumerate(values[step]))
+    result = np.zeros((k,) * len(factors))
+    if any(not len(values[step][i]) for step, i in evidence):
+        return result
+    potentials: list[Potential] = [((i,), belief[i][values[0][i]]) for i in sorted(needed[0])]
     for step, action in enumerate(plan):
         for i in sorted(needed[step + 1]):
             parents = dbn.parents(action, i)
-            index = np.ix_(*(supports[p] if step + where == 0 else full for where, p in parents), full)
+            index = np.ix_(*(values[step + where][p] for where, p in parents), values[step + 1][i])
             scope = tuple((step + where) * n + p for where, p in parents) + ((step + 1) * n + i,)
             potentials.append((scope, dbn.tensor(action, i)[index]))
-    fixed = {step * n + factor: value for (step, factor), value in evidence.items()}
-    potentials = [_fix(potential, fixed) for potential in potentials]
-    return contract(potentials, tuple(len(plan) * n + i for i in factors))
+    place = np.ix_(*(values[-1][i] for i in factors))
+    result[place] = contract(potentials, tuple(len(plan) * n + i for i in factors))
+    return result
 
 
 def joint_next(dbn: TwoSliceDBN, code: np.ndarray, action: int, drop: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -281,12 +287,6 @@ def _step(
         potentials.append((tuple(where * n + p for where, p in parents) + (n + i,), dbn.tensor(action, i)[index]))
         used |= set(dbn.parents_now[action][i])
     return potentials + [((p,), belief[p][supports[p]]) for p in sorted(used)]
-
-
-def _fix(potential: Potential, fixed: dict[int, int]) -> Potential:
-    scope, table = potential
-    index = tuple(fixed.get(v, slice(None)) for v in scope)
-    return tuple(v for v in scope if v not in fixed), table[index]
 
 
 def check_belief(dbn: TwoSliceDBN, belief: np.ndarray) -> np.ndarray:

@@ -6,8 +6,8 @@ elimination would need a table over all factors. `pruned` makes such a model out
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,12 +30,14 @@ def cone(dbn: TwoSliceDBN, plan: Sequence[int], factors: Sequence[int]) -> list[
     return [tuple(sorted(slice_)) for slice_ in needed]
 
 
-def reachable_values(dbn: TwoSliceDBN, code: np.ndarray, plan: Sequence[int]) -> list[tuple[np.ndarray, ...]]:
+def reachable_values(dbn: TwoSliceDBN, start: np.ndarray, plan: Sequence[int]) -> list[tuple[np.ndarray, ...]]:
     """Values that each factor may have after 0, 1, ..., T steps of a plan: [T + 1][N] arrays of values.
 
-    An upper bound: factors are taken as free of each other.
+    An upper bound: factors are taken as free of each other. `start` is a code, integers [N], or a belief [N, K].
     """
-    found = [tuple(np.array([int(value)]) for value in dbn._codes(code))]
+    start = np.asarray(start)
+    belief = np.eye(dbn.num_values)[dbn._codes(start)] if start.ndim == 1 else start
+    found = [tuple(np.flatnonzero(row) for row in belief)]
     full = np.arange(dbn.num_values)
     for action in plan:
         later: dict[int, np.ndarray] = {}
@@ -93,13 +95,20 @@ def step_codes(
     factors: Sequence[int],
     most: int = MAX_CODES,
     drop: float = 0.0,
+    visit: Callable[[int, np.ndarray], None] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One step of `follow`: from weighted codes int64 [M, N] to those of some factors after an action."""
+    """One step of `follow`: from weighted codes int64 [M, N] to those of some factors after an action.
+
+    `visit` is told of every factor and the rows of its table that are used.
+    """
     now, later = codes, np.zeros_like(codes)
     # factors of slice t are dropped as soon as nobody asks for them any more, so that codes merge early
     order = [i for i in dbn.order if i in factors]
     for position, i in enumerate(order):
-        table = dbn.cpt(action, i)[dbn.rows(action, i, now, later)] * weights[:, None]
+        rows = dbn.rows(action, i, now, later)
+        if visit is not None:
+            visit(i, rows)
+        table = dbn.cpt(action, i)[rows] * weights[:, None]
         source, values = np.nonzero(table > drop)
         now, later, weights = now[source], later[source], table[source, values]
         later[:, i] = values
@@ -110,6 +119,56 @@ def step_codes(
         if len(weights) > most:
             raise UserError(f"more than {most} codes are reachable; prune the model or ask for fewer factors")
     return later, weights
+
+
+@dataclass(frozen=True)
+class Reached:
+    """The part of a model that a plan from a code really uses: all else has probability 0 there."""
+
+    slices: list[tuple[int, ...]]
+    """[T + 1]: factors of every slice that the ones asked for depend on (see `cone`)."""
+    values: list[dict[int, np.ndarray]]
+    """[T + 1]: values that each of them can have."""
+    rows: list[dict[int, np.ndarray]]
+    """[T]: rows of each factor's table that are used in the step."""
+    codes: np.ndarray
+    """uint8 [M, N]: codes after the plan; factors not asked for are 0."""
+    weights: np.ndarray
+    """float64 [M]: their probabilities."""
+
+
+def reached(
+    dbn: TwoSliceDBN, code: np.ndarray, plan: Sequence[int], factors: Sequence[int], most: int = MAX_CODES
+) -> Reached:
+    """What a plan uses of a model, exactly: rows and values that can be met together, not factor by factor.
+
+    Raises:
+        UserError: more than `most` codes are reachable.
+    """
+    slices = cone(dbn, plan, factors)
+    keep = np.zeros(dbn.num_factors, dtype=bool)
+    keep[list(slices[0])] = True
+    codes, weights = np.where(keep, dbn._codes(code), 0)[None], np.ones(1)
+    values = [{i: np.array([int(code[i])]) for i in slices[0]}]
+    rows: list[dict[int, np.ndarray]] = []
+    for step, action in enumerate(plan):
+        used: dict[int, np.ndarray] = {}
+        found: dict[int, np.ndarray] = {}
+
+        def visit(
+            i: int,
+            met: np.ndarray,
+            action: int = int(action),
+            used: dict[int, np.ndarray] = used,
+            found: dict[int, np.ndarray] = found,
+        ) -> None:
+            used[i] = np.unique(met)
+            found[i] = np.flatnonzero((dbn.cpt(action, i)[used[i]] > 0).any(axis=0))
+
+        codes, weights = step_codes(dbn, codes, weights, int(action), slices[step + 1], most, visit=visit)
+        rows.append(used)
+        values.append(found)
+    return Reached(slices, values, rows, codes.astype(np.uint8), weights)
 
 
 def _merged(

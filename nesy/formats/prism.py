@@ -3,18 +3,21 @@
 A factor that looks at others of slice t+1 must move after them. So a step of an action is a chain of
 synchronised moves `action`, `action_1`, ...: level by level the next values are drawn into `y_i`, and the last
 move, `action_end`, makes them the present ones. Without such arcs a step is one move on the `x_i` themselves.
+
+Reward and termination, where the model has them, become the reward structure "reward" and the flag `done`, after
+which nothing moves; rows of those tables that experience never met pay nothing and end nothing.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from nesy.dbn.model import TwoSliceDBN
-from nesy.dbn.plans import cone, reachable_values
+from nesy.dbn.plans import Reached, reached
+from nesy.dbn.step_tables import StepTable
 from nesy.formats.bayes_nodes import identifier
 from nesy.run_folder import atomic_path
 
@@ -25,60 +28,117 @@ def write(
     start: np.ndarray | None = None,
     plan: Sequence[int] | None = None,
     factors: Sequence[int] | None = None,
+    goal: Mapping[int, int] | None = None,
 ) -> None:
     """Write `dbn` to the file `path` (see `model_text`); by default it starts in the most probable initial values."""
-    text = model_text(dbn, dbn.initial.argmax(axis=1) if start is None else start, plan, factors)
+    text = model_text(dbn, dbn.initial.argmax(axis=1) if start is None else start, plan, factors, goal)
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def model_text(
-    dbn: TwoSliceDBN, start: np.ndarray, plan: Sequence[int] | None = None, factors: Sequence[int] | None = None
+    dbn: TwoSliceDBN,
+    start: np.ndarray,
+    plan: Sequence[int] | None = None,
+    factors: Sequence[int] | None = None,
+    goal: Mapping[int, int] | None = None,
 ) -> str:
     """The model as PRISM text.
 
     Args:
         dbn: the model.
         start: integers [N]: the initial code.
-        plan: the actions to take; a chain (`dtmc`) over them with the step counter `step` and the label `end`.
-            Without it a Markov decision process (`mdp`) in which every action is always possible.
-        factors: with a plan, the factors asked for at its end: only their cone of influence is written.
+        plan: the actions to take; a chain (`dtmc`) over them with the step counter `step` and the label `end`, of
+            which only the rows are written that can be reached. Without it a Markov decision process (`mdp`) in
+            which every action is always possible.
+        factors: with a plan, the factors asked for at its end: only their cone of influence is written; those of
+            the goal by default.
+        goal: {factor: value}, becomes the label `goal`.
+
+    Raises:
+        UserError: more codes are reachable under the plan than can be followed.
     """
-    values = None if plan is None else reachable_values(dbn, start, plan)
+    asked = list(goal) if goal and factors is None else range(dbn.num_factors) if factors is None else list(factors)
+    used = None if plan is None else reached(dbn, np.asarray(start), plan, asked)
     levels = [_levels(dbn, a) for a in range(dbn.num_actions)]
-    layered = any(max(level) > 0 for level in levels)
-    names = [f"x{i}" for i in range(dbn.num_factors)]
+    tables = {} if plan is not None else {n: t for n, t in dbn.step_tables.items() if n in ("reward", "termination")}
+    layered = any(max(level) > 0 for level in levels) or any(
+        ps for table in tables.values() for per_action in table.parents_next for ps in per_action
+    )
     actions = [identifier(name) for name in dbn.action_names]
-    needed = None if plan is None else cone(dbn, plan, range(dbn.num_factors) if factors is None else factors)
     lines = ["mdp" if plan is None else "dtmc", ""]
     lines += [f"// x{i}: {name}" for i, name in enumerate(dbn.factor_names)]
     moves = _moves(actions, levels, layered)
-    lines += _clock(moves, plan, layered)
-    for i, name in enumerate(names):
-        used = None if needed is None else [step for step in range(1, len(needed)) if i in needed[step]]
-        if needed is not None and not used and i not in needed[0]:
+    lines += _clock(moves, plan, layered, "termination" in tables)
+    for i in range(dbn.num_factors):
+        if used is not None and not any(i in factors_of for factors_of in used.slices):
             continue
         top = dbn.num_values - 1
-        lines += ["", f"module factor_{name}", f"  {name} : [0..{top}] init {int(start[i])};"]
+        lines += ["", f"module factor_x{i}", f"  x{i} : [0..{top}] init {int(start[i])};"]
         if layered:
             lines.append(f"  y{i} : [0..{top}] init 0;")
-        if plan is None:
-            for a in range(dbn.num_actions):
-                lines += _commands(dbn, a, i, "", moves[a], levels[a][i], layered, None)
-        else:
-            for step, a in enumerate(plan):
-                guard = f"step={step} & "
-                if used is not None and step + 1 in used:
-                    assert values is not None
-                    possible = (values[step], values[step + 1])
-                    lines += _commands(dbn, a, i, guard, moves[a], levels[a][i], layered, possible)
-                elif layered:
-                    lines += [f"  [{moves[a][levels[a][i]]}] step={step} -> true;"]
-                    lines += [f"  [{moves[a][-1]}] step={step} -> ({name}'=0);"]
-                else:
-                    lines += [f"  [{actions[a]}] step={step} -> ({name}'=0);"]
+        for a in range(dbn.num_actions) if plan is None else ():
+            lines += _commands(dbn, a, i, "", moves[a], levels[a][i], layered, np.arange(dbn.num_rows(a, i)))
+        for step, a in enumerate(plan or ()):
+            lines += _step(dbn, a, i, step, moves[a], levels[a][i], layered, used)
         lines.append("endmodule")
+    lines += _outcomes(dbn, tables, moves, layered)
+    if goal:
+        lines += ["", f'label "goal" = {" & ".join(f"x{i}={v}" for i, v in goal.items())};']
     return "\n".join(lines) + "\n"
+
+
+def _step(
+    dbn: TwoSliceDBN,
+    action: int,
+    factor: int,
+    step: int,
+    moves: list[str],
+    level: int,
+    layered: bool,
+    used: Reached | None,
+) -> list[str]:
+    """What one factor does in one step of a plan; it falls to 0 where nobody asks for it."""
+    guard = f"step={step} & "
+    if used is not None and factor in used.slices[step + 1]:
+        return _commands(dbn, action, factor, guard, moves, level, layered, used.rows[step][factor])
+    if layered:
+        return [f"  [{moves[level]}] step={step} -> true;", f"  [{moves[-1]}] step={step} -> (x{factor}'=0);"]
+    return [f"  [{moves[0]}] step={step} -> (x{factor}'=0);"]
+
+
+def _outcomes(dbn: TwoSliceDBN, tables: dict[str, StepTable], moves: list[list[str]], layered: bool) -> list[str]:
+    """Reward structure and termination flag."""
+    lines: list[str] = []
+    if "termination" in tables:
+        lines += ["", "module ending", "  done : bool init false;"]
+        for a, names in enumerate(moves):
+            chance = _sum_of_rows(tables["termination"], a, -1, layered)
+            ends = f"{chance}:(done'=true) + 1-({chance}):(done'=false)" if chance != "0" else "true"
+            lines.append(f"  [{names[-1]}] true -> {ends};")
+        lines += ["endmodule", "", 'label "done" = done;']
+    if "reward" in tables:
+        lines += ["", 'rewards "reward"']
+        for a, names in enumerate(moves):
+            pay = _sum_of_rows(tables["reward"], a, 0, layered)
+            lines += [f"  [{names[-1]}] true : {pay};"] if pay != "0" else []
+        lines.append("endrewards")
+    return lines
+
+
+def _sum_of_rows(table: StepTable, action: int, column: int, layered: bool) -> str:
+    """What a step table says, as a sum over its rows: their conditions exclude each other."""
+    parents = table.parents(action, 0)
+    values, counts = table.table(action, 0)[:, column], table.counts(action, 0)
+    names = [("y" if where and layered else "x") + str(p) for where, p in parents]
+    shape = (table.num_values,) * len(parents)
+    terms = []
+    for row in np.flatnonzero((counts > 0) & (np.abs(values) > 1e-9)).tolist():
+        if not parents:
+            return repr(float(values[row]))
+        when = " & ".join(f"{n}={v}" for n, v in zip(names, np.unravel_index(row, shape), strict=True))
+        terms.append(f"({when} ? {float(values[row])!r} : 0)")
+    return " + ".join(terms) or "0"
 
 
 def _levels(dbn: TwoSliceDBN, action: int) -> list[int]:
@@ -99,7 +159,7 @@ def _moves(actions: list[str], levels: list[list[int]], layered: bool) -> list[l
     ]
 
 
-def _clock(moves: list[list[str]], plan: Sequence[int] | None, layered: bool) -> list[str]:
+def _clock(moves: list[list[str]], plan: Sequence[int] | None, layered: bool, ends: bool) -> list[str]:
     """The module that says which move comes next."""
     lines = ["", "module clock"]
     if plan is not None:
@@ -114,6 +174,7 @@ def _clock(moves: list[list[str]], plan: Sequence[int] | None, layered: bool) ->
         for step in steps:
             for phase, move in enumerate(names):
                 guards = [] if step is None else [f"step={step}"]
+                guards += ["!done"] if ends and phase == 0 else []
                 updates = []
                 last = phase == len(names) - 1
                 if layered:
@@ -140,20 +201,19 @@ def _commands(
     moves: list[str],
     level: int,
     layered: bool,
-    possible: tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]] | None,
+    rows: np.ndarray,
 ) -> list[str]:
-    """The commands of one factor under one action; with `possible`, for those values of slice t and t+1 alone."""
+    """The commands of one factor under one action, for some rows of its table."""
     own = "y" if layered else "x"
     parents = dbn.parents(action, factor)
     names = [("y" if where else "x") + str(p) for where, p in parents]
-    full = np.arange(dbn.num_values)
-    sets = [full if possible is None else possible[where][p] for where, p in parents]
-    tensor = dbn.tensor(action, factor)
+    shape = (dbn.num_values,) * len(parents)
+    table = dbn.cpt(action, factor)
     lines = []
-    for values in itertools.product(*(column.tolist() for column in sets)):
-        row = tensor[values]
+    for row in rows.tolist():
+        values = np.unravel_index(row, shape) if shape else ()
         when = guard + (" & ".join(f"{n}={v}" for n, v in zip(names, values, strict=True)) or "true")
-        then = " + ".join(f"{p!r}:({own}{factor}'={k})" for k, p in enumerate(row.tolist()) if p > 0)
+        then = " + ".join(f"{p!r}:({own}{factor}'={k})" for k, p in enumerate(table[row].tolist()) if p > 0)
         lines.append(f"  [{moves[level]}] {when} -> {then};")
     if layered:
         lines.append(f"  [{moves[-1]}] {guard}true -> (x{factor}'=y{factor}) & (y{factor}'=0);")
