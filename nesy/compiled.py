@@ -36,3 +36,10 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         return dispatcher
 
     return compile_later
+
+
+def overload(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`numba.extending.overload(function)`: choose by the types of the arguments what compiled code runs for it."""
+    from numba.extending import overload as by_types
+
+    return by_types(function, strict=False)  # type: ignore[no-any-return]

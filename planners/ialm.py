@@ -97,6 +97,9 @@ TIMEOUT = 5
 
 
 FORMAT, VERSION = "nesy-ialm", 1
+_DAMAGE = (OSError, ValueError, LookupError, TypeError, AttributeError, NotImplementedError, EOFError,
+           RuntimeError, zipfile.BadZipFile, zlib.error)  # fmt: skip
+"""What reading a damaged archive may raise."""
 _TABLE_ARRAYS = ("slot", "value", "ordered", "yes", "no", "moments")
 
 
@@ -311,17 +314,9 @@ class IALM:
             return model
         except FileNotFoundError:
             raise UserError(f"{path}: no such file; learn the tables again (nesy compare)") from None
-        except (
-            OSError,
-            ValueError,
-            KeyError,
-            TypeError,
-            AttributeError,
-            zipfile.BadZipFile,
-            zlib.error,
-            EOFError,
-        ) as error:
-            raise UserError(f"{path}: damaged ({type(error).__name__}: {error}); learn the tables again") from None
+        except _DAMAGE as error:
+            reason = f"{type(error).__name__}: {str(error)[:200]}"
+            raise UserError(f"{path}: damaged ({reason}); learn the tables again (nesy compare)") from None
 
 
 def learn(dbn: TwoSliceDBN, codec: Codec, experience: Experience, folder: Path | str) -> IALM:

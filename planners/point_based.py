@@ -16,9 +16,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from planners import bound_kernels as kernels
+from planners.bound_kernels import BoundSet
 from planners.pomdp import TabularPOMDP
 
 _FEW = 2000  # points x actions x observations
+_DEEPEST = 400
+_ROOM = 256
+Belief = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -27,22 +32,27 @@ class Certificate:
 
     Attributes:
         lower, upper: bounds of the optimal discounted value.
-        alphas: float64 [M, S], the lower bound's vectors.
-        alpha_actions: int64 [M], the action that each stands for.
+        vectors: of the lower bound, blind policies not counted.
         trials: searches from the start belief.
         seconds: time spent.
+        bounds: both bounds at any belief, for a search to go on from.
     """
 
     lower: float
     upper: float
-    alphas: np.ndarray
-    alpha_actions: np.ndarray
+    vectors: int
     trials: int
     seconds: float
+    bounds: PointBounds
 
     def action(self, belief: np.ndarray) -> int:
         """The action of the vector that is best at `belief`."""
-        return int(self.alpha_actions[(self.alphas @ belief).argmax()])
+        return self.bounds.policy(sparse_belief(belief))
+
+    def at(self, belief: np.ndarray) -> tuple[float, float]:
+        """Lower and upper bound at `belief`, float64 [S]."""
+        sparse = sparse_belief(belief)
+        return self.bounds.lower(sparse), self.bounds.upper(sparse)
 
 
 def solve(model: TabularPOMDP, gap: float = 1e-3, time_limit: float = 60.0, max_trials: int = 100_000) -> Certificate:
@@ -59,192 +69,234 @@ def solve(model: TabularPOMDP, gap: float = 1e-3, time_limit: float = 60.0, max_
     """
     if not model.discount < 1:
         raise ValueError("the solver needs a discount below 1")
-    bounds = _Bounds(model)
+    bounds = PointBounds(model)
+    start = sparse_belief(model.start)
+    bounds.improve(start)  # compiles the kernels, which is not to count
     started = time.perf_counter()
     trials = 0
     while trials < max_trials and time.perf_counter() - started < time_limit:
-        lower, upper = bounds.lower(model.start), bounds.upper(model.start)
+        lower, upper = bounds.lower(start), bounds.upper(start)
         if lower > upper + 1e-6:
             warnings.warn(f"lower bound {lower:.6g} above upper bound {upper:.6g}", RuntimeWarning, stacklevel=2)
         if upper - lower <= gap:
             break
-        bounds.explore(model.start, gap, started + time_limit)
-        bounds.sweep(gap)
+        bounds.explore(start, gap, started + time_limit)
+        bounds.sweep(start, gap)
         trials += 1
     return Certificate(
-        lower=bounds.lower(model.start),
-        upper=bounds.upper(model.start),
-        alphas=bounds.alphas[: bounds.count].copy(),
-        alpha_actions=bounds.alpha_actions[: bounds.count].copy(),
+        lower=bounds.lower(start),
+        upper=bounds.upper(start),
+        vectors=int(bounds.arrays.count[0]),
         trials=trials,
         seconds=time.perf_counter() - started,
+        bounds=bounds,
     )
 
 
-class _Bounds:
-    """Both bounds, as growing arrays."""
+def sparse_belief(belief: np.ndarray) -> Belief:
+    """A belief float64 [S] as (states it allows, their probabilities)."""
+    index = np.flatnonzero(belief > 0).astype(np.int64)
+    return index, np.ascontiguousarray(belief[index], np.float64)
 
-    def __init__(self, model: TabularPOMDP) -> None:
-        self.model = model
-        num_states, num_actions = len(model.states), len(model.actions)
-        self.alphas = np.zeros((256, num_states))
-        self.alpha_actions = np.zeros(256, np.int64)
-        self.count, self.prune_at = 0, 64
-        self.point_of: dict[bytes, int] = {}
-        for a in range(num_actions):
-            self._add_alpha(self._blind(a), a)
-        self.corner = self._fast_informed()
-        self.points = np.zeros((256, num_states))
-        self.point_values = np.zeros(256)
-        self.num_points = 0
 
-    def _blind(self, action: int) -> np.ndarray:
-        """Value of always doing `action`: iterated from below, so it stays a lower bound."""
-        worst = min(float(self.model.reward[action].min()), 0.0) / (1 - self.model.discount)
-        value = np.full(len(self.model.states), worst)
-        value[self.model.terminal] = 0.0
+def blind_policies(model: TabularPOMDP) -> np.ndarray:
+    """Value of always doing one action, float64 [A, S]: iterated from below, so it is a lower bound at any time."""
+    out = np.empty_like(model.reward)
+    for a, (matrix, reward) in enumerate(zip(model.transition, model.reward, strict=True)):
+        value = np.full(len(reward), min(float(reward.min()), 0.0) / (1 - model.discount))
+        value[model.terminal] = 0.0
         for _ in range(2000):
-            after = self.model.reward[action] + self.model.discount * (self.model.transition[action] @ value)
-            if np.abs(after - value).max() < 1e-9:
-                break
+            after = reward + model.discount * (matrix @ value)
+            done = np.abs(after - value).max() < 1e-9
             value = after
-        return value
-
-    def _fast_informed(self) -> np.ndarray:
-        """Fast informed bound: float64 [S], iterated from above."""
-        model = self.model
-        q = model.fully_observed + 1e-9
-        for _ in range(300):
-            after = np.empty_like(q)
-            for a, matrix in enumerate(model.transition):
-                best = np.full(len(model.states), 0.0)
-                for o in range(len(model.observations)):
-                    weighted = model.observation[a][:, o]
-                    if weighted.any():
-                        best += (matrix @ (weighted[:, None] * q.T)).max(axis=1)
-                after[a] = model.reward[a] + model.discount * best
-            done = np.abs(after - q).max() < 1e-7
-            q = np.minimum(after, q)
             if done:
                 break
-        return np.asarray(q.max(axis=0))
+        out[a] = value
+    return out
 
-    def _add_alpha(self, alpha: np.ndarray, action: int) -> None:
-        if self.count == len(self.alphas):
-            self.alphas = np.concatenate([self.alphas, np.zeros_like(self.alphas)])
-            self.alpha_actions = np.concatenate([self.alpha_actions, np.zeros_like(self.alpha_actions)])
-        self.alphas[self.count], self.alpha_actions[self.count] = alpha, action
-        self.count += 1
 
-    def _prune(self) -> None:
-        """Drop vectors that another one is at least as good as everywhere."""
-        vectors = self.alphas[: self.count]
-        kept: list[int] = []
-        for i in np.argsort(-vectors.sum(axis=1), kind="stable"):
-            if not kept or not (vectors[kept] >= vectors[i] - 1e-12).all(axis=1).any():
-                kept.append(int(i))
-        kept.sort()
-        self.alphas[: len(kept)], self.alpha_actions[: len(kept)] = vectors[kept], self.alpha_actions[kept]
-        self.count = len(kept)
-        self.prune_at = 2 * self.count + 64
+def fast_informed_bound(model: TabularPOMDP) -> np.ndarray:
+    """Upper bound of the value per state, float64 [S]: iterated from above (Hauskrecht 2000)."""
+    q = model.fully_observed + 1e-8
+    for _ in range(300):
+        after = np.empty_like(q)
+        for a, matrix in enumerate(model.transition):
+            best = np.zeros(len(model.states))
+            for o in range(len(model.observations)):
+                weighted = model.observation[a][:, o]
+                if weighted.any():
+                    best += (matrix @ (weighted[:, None] * q.T)).max(axis=1)
+            after[a] = model.reward[a] + model.discount * best
+        done = np.abs(after - q).max() < 1e-7
+        q = np.minimum(after, q)
+        if done:
+            break
+    return np.asarray(q.max(axis=0))
 
-    def lower(self, belief: np.ndarray) -> float:
-        return float((self.alphas[: self.count] @ belief).max())
 
-    def upper(self, belief: np.ndarray) -> float:
-        base = float(self.corner @ belief)
-        if not self.num_points:
-            return base
-        support = np.flatnonzero(belief > 0)
-        points = self.points[: self.num_points]
-        # A point with weight outside the belief's support has ratio 0 and says nothing.
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ratios = np.where(points[:, support] > 0, belief[support] / points[:, support], np.inf)
-        inside = points[:, support].sum(axis=1) > 1 - 1e-9
-        ratio = np.where(inside, ratios.min(axis=1), 0.0)
-        gains = (self.point_values[: self.num_points] - points @ self.corner) * ratio
-        return base + min(float(gains.min()), 0.0)
+class PointBounds:
+    """Both bounds, as growing arrays (planners.bound_kernels).
 
-    def explore(self, start: np.ndarray, gap: float, deadline: float) -> None:
+    Attributes:
+        flat: the model for the kernels.
+        arrays: the bounds for the kernels; replaced when they grow.
+    """
+
+    def __init__(self, model: TabularPOMDP) -> None:
+        self.model, self.flat = model, kernels.flatten(model)
+        num_actions, num_states = model.reward.shape
+        num_observations = len(model.observations)
+        self.arrays = BoundSet(
+            blind_policies(model),
+            np.zeros(_ROOM + 1, np.int64),
+            np.zeros(0, np.int64),
+            np.zeros(0),
+            np.zeros(_ROOM, np.int64),
+            fast_informed_bound(model),
+            np.zeros(_ROOM + 1, np.int64),
+            np.zeros(0, np.int64),
+            np.zeros(0),
+            np.zeros(_ROOM),
+            np.zeros(2, np.int64),
+        )
+        self.prune_at = _ROOM
+        self.point_of: dict[bytes, int] = {}
+        self.dense, self.other = np.zeros(num_states), np.zeros(num_states)
+        self.q_lower, self.q_upper = np.zeros(num_actions), np.zeros(num_actions)
+        shape = (num_actions, num_observations)
+        self.chosen, self.chances = np.zeros(shape, np.int64), np.zeros(shape)
+        self.lowers, self.uppers = np.zeros(shape), np.zeros(shape)
+
+    def lower(self, belief: Belief) -> float:
+        """L at a sparse belief."""
+        return float(kernels.lower_at(self.arrays, *belief, self.dense)[0])
+
+    def policy(self, belief: Belief) -> int:
+        """The action behind L at a sparse belief."""
+        which = int(kernels.lower_at(self.arrays, *belief, self.dense)[1]) - len(self.arrays.blind)
+        return int(self.arrays.alpha_action[which]) if which >= 0 else which + len(self.arrays.blind)
+
+    def upper(self, belief: Belief) -> float:
+        """U at a sparse belief."""
+        return float(kernels.upper_at(self.arrays, *belief, self.dense))
+
+    def explore(self, start: Belief, gap: float, deadline: float) -> None:
         """One trial: down to where the bounds are close enough for their depth, and back up with updates."""
-        model = self.model
-        path = [start]
-        belief, allowed = start, gap
-        while time.perf_counter() < deadline and len(path) < 400:
+        path, belief, allowed = [start], start, gap
+        while time.perf_counter() < deadline and len(path) < _DEEPEST:
+            self._look(belief)
             if self.upper(belief) - self.lower(belief) <= allowed:
                 break
-            values, followers = zip(*(self._outlook(belief, a) for a in range(len(model.actions))), strict=True)
-            allowed /= model.discount
-            excess = [
-                (chance * (self.upper(after) - self.lower(after) - allowed), -o, after)
-                for o, (chance, after) in enumerate(followers[int(np.argmax(values))])
-                if chance > 0
-            ]
-            most = max(excess, key=lambda item: item[:2])
-            if most[0] <= 0:
+            allowed /= self.model.discount
+            a = int(self.q_upper.argmax())
+            excess = self.chances[a] * (self.uppers[a] - self.lowers[a] - allowed)
+            excess[self.chances[a] <= 0] = -np.inf
+            o = int(excess.argmax())
+            if excess[o] <= 0:
                 break
-            belief = most[2]
+            index, value, _ = kernels.follow(self.flat, *belief, a, o, self.dense)
+            belief = (index, value)
             path.append(belief)
         for visited in reversed(path):
-            self._improve(visited)
+            self.improve(visited)
 
-    def sweep(self, gap: float) -> None:
+    def sweep(self, start: Belief, gap: float) -> None:
         """Where the points are few, improve all of them until little changes: values then travel round cycles."""
-        if self.num_points * len(self.model.actions) * len(self.model.observations) > _FEW:
+        points = int(self.arrays.count[1])
+        if points * self.chances.size > _FEW:
             return
         before = np.inf
         for _ in range(50):
-            for i in range(self.num_points):
-                self._improve(self.points[i])
-            now = self.upper(self.model.start) - self.lower(self.model.start)
+            for p in range(points):
+                begin, end = self.arrays.point_begin[p : p + 2]
+                self.improve((self.arrays.point_index[begin:end], self.arrays.point_value[begin:end]))
+            now = self.upper(start) - self.lower(start)
             if before - now < 0.01 * gap:
                 break
             before = now
 
-    def _outlook(self, belief: np.ndarray, action: int) -> tuple[float, list[tuple[float, np.ndarray]]]:
-        """Upper bound of Q(b, a), and (chance, next belief) per observation."""
-        model = self.model
-        predicted = model.predict(belief, action)
-        value = float(model.reward[action] @ belief)
-        followers = []
-        for o in range(len(model.observations)):
-            joint = predicted * model.observation[action][:, o]
-            chance = float(joint.sum())
-            if chance <= 1e-12:
-                followers.append((0.0, belief))
-                continue
-            after = joint / chance
-            value += model.discount * chance * self.upper(after)
-            followers.append((chance, after))
-        return value, followers
-
-    def _improve(self, belief: np.ndarray) -> None:
+    def improve(self, belief: Belief) -> None:
         """Backups of both bounds at one belief."""
-        model = self.model
-        best_value, best_alpha, best_action, best_upper = -np.inf, None, 0, -np.inf
-        for a, matrix in enumerate(model.transition):
-            predicted = model.predict(belief, a)
-            weighted = predicted[:, None] * model.observation[a]
-            chosen = (self.alphas[: self.count] @ weighted).argmax(axis=0)
-            future = (model.observation[a] * self.alphas[chosen].T).sum(axis=1)
-            alpha = model.reward[a] + model.discount * (matrix @ future)
-            value = float(alpha @ belief)
-            if value > best_value:
-                best_value, best_alpha, best_action = value, alpha, a
-            best_upper = max(best_upper, self._outlook(belief, a)[0])
-        assert best_alpha is not None
-        if best_value > self.lower(belief) + 1e-10:
-            self._add_alpha(best_alpha, best_action)
-            if self.count >= self.prune_at:
-                self._prune()
-        if best_upper < self.upper(belief) - 1e-10:
-            key = np.round(belief, 10).tobytes()
-            if key in self.point_of:
-                self.point_values[self.point_of[key]] = best_upper
-                return
-            self.point_of[key] = self.num_points
-            if self.num_points == len(self.points):
-                self.points = np.concatenate([self.points, np.zeros_like(self.points)])
-                self.point_values = np.concatenate([self.point_values, np.zeros_like(self.point_values)])
-            self.points[self.num_points], self.point_values[self.num_points] = belief, best_upper
-            self.num_points += 1
+        self._look(belief)
+        action = int(self.q_lower.argmax())
+        if self.q_lower[action] > self.lower(belief) + 1e-10:
+            self._add_alpha(belief[0], action)
+        upper = float(self.q_upper.max())
+        if upper < self.upper(belief) - 1e-10:
+            self._add_point(belief, upper)
+
+    def _look(self, belief: Belief) -> None:
+        kernels.look(
+            self.flat,
+            self.arrays,
+            *belief,
+            self.dense,
+            self.other,
+            self.q_lower,
+            self.q_upper,
+            self.chosen,
+            self.chances,
+            self.lowers,
+            self.uppers,
+        )
+
+    def _add_alpha(self, index: np.ndarray, action: int) -> None:
+        made = kernels.backed_up(self.flat, self.arrays, action, self.chosen[action], index)
+        if self.arrays.count[0] == self.prune_at:
+            self._prune()
+        count = int(self.arrays.count[0])
+        begin = int(self.arrays.alpha_begin[count])
+        end = begin + len(index)
+        self.arrays = self.arrays._replace(
+            alpha_begin=_with_room(self.arrays.alpha_begin, count + 2),
+            alpha_action=_with_room(self.arrays.alpha_action, count + 1),
+            alpha_index=_with_room(self.arrays.alpha_index, end),
+            alpha_value=_with_room(self.arrays.alpha_value, end),
+        )
+        self.arrays.alpha_index[begin:end], self.arrays.alpha_value[begin:end] = index, made
+        self.arrays.alpha_begin[count + 1], self.arrays.alpha_action[count] = end, action
+        self.arrays.count[0] = count + 1
+
+    def _prune(self) -> None:
+        """Drop vectors that another one over the same states is at least as good as."""
+        arrays, count = self.arrays, int(self.arrays.count[0])
+        spans = list(zip(arrays.alpha_begin[:count], arrays.alpha_begin[1 : count + 1], strict=True))
+        groups: dict[bytes, int] = {}
+        group = np.array([groups.setdefault(arrays.alpha_index[i:j].tobytes(), len(groups)) for i, j in spans])
+        kept = np.flatnonzero(kernels.undominated(arrays, group))
+        entries = np.concatenate([np.arange(*spans[m]) for m in kept])
+        sizes = np.array([spans[m][1] - spans[m][0] for m in kept])
+        arrays.alpha_index[: len(entries)] = arrays.alpha_index[entries]
+        arrays.alpha_value[: len(entries)] = arrays.alpha_value[entries]
+        arrays.alpha_begin[1 : len(kept) + 1] = np.cumsum(sizes)
+        arrays.alpha_action[: len(kept)] = arrays.alpha_action[kept]
+        arrays.count[0] = len(kept)
+        self.prune_at = 2 * len(kept) + _ROOM
+
+    def _add_point(self, belief: Belief, value: float) -> None:
+        index, mass = belief
+        gain = value - float(self.arrays.corner[index] @ mass)
+        key = index.tobytes() + np.round(mass, 10).tobytes()
+        if key in self.point_of:
+            self.arrays.point_gain[self.point_of[key]] = gain
+            return
+        count = int(self.arrays.count[1])
+        begin = int(self.arrays.point_begin[count])
+        end = begin + len(index)
+        self.arrays = self.arrays._replace(
+            point_begin=_with_room(self.arrays.point_begin, count + 2),
+            point_gain=_with_room(self.arrays.point_gain, count + 1),
+            point_index=_with_room(self.arrays.point_index, end),
+            point_value=_with_room(self.arrays.point_value, end),
+        )
+        self.point_of[key] = count
+        self.arrays.point_index[begin:end], self.arrays.point_value[begin:end] = index, mass
+        self.arrays.point_begin[count + 1], self.arrays.point_gain[count] = end, gain
+        self.arrays.count[1] = count + 1
+
+
+def _with_room(array: np.ndarray, size: int) -> np.ndarray:
+    """The array itself if it holds `size` entries, else a copy with room for twice as many."""
+    if len(array) >= size:
+        return array
+    return np.concatenate([array, np.zeros(2 * size - len(array), array.dtype)])

@@ -1,58 +1,47 @@
-"""Online tree search in explicit POMDPs: PO-UCT in compiled kernels, with leaf values from the model.
+"""Online tree search in explicit POMDPs.
 
-    plan(b) -> (argmax_a Q(b, a), info); Q estimated by simulations s ~ b through a tree of (action, observation)
+    plan(b) -> (argmax_a Q(b, a), info); update(a, o) keeps what the search knows of the belief that follows
 
-Values are backed up as maxima (Bellman) rather than as averages of what was tried. A leaf is worth what the model
-says of the sampled state: between always doing the best single action (lower) and the fully observed process
-(upper), never a uniform rollout. The person-following model has a search of its own (planners.ialm_search) on the
-same tree. Source: Silver and Veness 2010.
+Two methods over the same tables:
+
+- `bounds` (the default): a tree of exact beliefs with a lower and an upper bound at every node, always widened where
+  the root's bounds gain most (planners.bound_search). Its bounds come from an offline solver stopped early.
+- `po-uct`: simulations s ~ b through a tree of (action, observation) by UCB1 (planners.walk), with Bellman's backup.
+  A leaf is worth what the model says of the sampled state: always doing the best single action (lower), the fully
+  observed process (upper), or between, never a uniform rollout. All but the lower one value leaves as if the state
+  were known there, so that looking is never worth its price. Sources: Silver and Veness 2010; Kocsis and Szepesvari
+  2006.
 """
 
 from __future__ import annotations
 
 import time
 import warnings
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
-from nesy.compiled import njit
+from planners import bound_search
+from planners.bound_search import BeliefTree
+from planners.drawing import drawing_of
+from planners.point_based import blind_policies, solve, sparse_belief
 from planners.pomdp import TabularPOMDP
-from planners.random_bits import stream, uniform
-from planners.tree import Tree, allocate, backup_best, best_by_ucb, clear, find_child
+from planners.random_bits import stream
+from planners.tree import allocate, clear, reroot
+from planners.walk import PackedPOMDP, TabularBelief, best_tried, walks
 
-_CHUNK = 256  # simulations between two looks at the clock
-
-
-class PackedPOMDP(NamedTuple):
-    """A `TabularPOMDP` in flat arrays; successors of (a, s) lie at begin[a, s] : begin[a, s + 1]."""
-
-    begin: np.ndarray
-    successor: np.ndarray
-    cumulative: np.ndarray
-    observation: np.ndarray  # float64 [A, S', O], cumulative
-    reward: np.ndarray
-    terminal: np.ndarray
-    leaf: np.ndarray
+_TOLERANCE = 1e-6
+_START_GAP = 0.01
+Method = Literal["bounds", "po-uct"]
 
 
 def leaf_values(model: TabularPOMDP) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper value of every state, float64 [S] each: best blind policy, fully observed optimum."""
-    lower = np.full(len(model.states), -np.inf)
-    for matrix, reward in zip(model.transition, model.reward, strict=True):
-        value = np.zeros(len(model.states))
-        for _ in range(2000):
-            after = reward + model.discount * (matrix @ value)
-            done = np.abs(after - value).max() < 1e-9
-            value = after
-            if done:
-                break
-        lower = np.maximum(lower, value)
-    return lower, model.fully_observed.max(axis=0)
+    return blind_policies(model).max(axis=0), model.fully_observed.max(axis=0)
 
 
 def pack(model: TabularPOMDP, leaf: np.ndarray) -> PackedPOMDP:
-    """The arrays of `model` for kernels; `leaf` float64 [S]."""
+    """The arrays of `model` for the walk; `leaf` float64 [S]."""
     begins, successors, cumulatives, offset = [], [], [], 0
     for matrix in model.transition:
         matrix.sum_duplicates()
@@ -67,9 +56,9 @@ def pack(model: TabularPOMDP, leaf: np.ndarray) -> PackedPOMDP:
         np.concatenate(successors),
         np.concatenate(cumulatives),
         np.cumsum(model.observation, axis=2),
-        np.ascontiguousarray(model.reward),
+        np.ascontiguousarray(model.reward, np.float64),
         np.ascontiguousarray(model.terminal),
-        np.ascontiguousarray(leaf),
+        np.ascontiguousarray(leaf, np.float64),
     )
 
 
@@ -77,13 +66,17 @@ class TreeSearch:
     """Anytime search in an explicit POMDP.
 
     Args:
-        model: the POMDP.
-        rng: seeds the search's own stream.
-        simulations: per decision.
-        depth: deepest step looked ahead.
-        exploration: weight of UCB1's bonus; the range of the rewards by default.
-        time_limit: seconds per decision after which to stop early; 0 for none.
-        leaf: value of leaves: `lower`, `upper`, or the `middle` of the two.
+        model: the POMDP, with a discount below 1.
+        rng: seeds the search's own stream (`po-uct`; `bounds` draws nothing).
+        simulations: per decision: simulated walks, or leaves expanded.
+        depth: deepest step looked ahead (`po-uct`).
+        exploration: weight of UCB1's bonus; the range of the rewards by default (`po-uct`).
+        time_limit: seconds per decision after which to stop early; 0 for none. With a limit the machine decides how
+            far the search gets, so results need not repeat.
+        leaf: value of leaves: `lower`, `upper`, or the `middle` of the two (`po-uct`).
+        method: see the module's head.
+        trials: searches of the offline solver whose bounds the method `bounds` starts from.
+        reuse: whether the tree below what happened is kept by `update`.
     """
 
     def __init__(
@@ -94,8 +87,18 @@ class TreeSearch:
         depth: int = 40,
         exploration: float | None = None,
         time_limit: float = 0.0,
-        leaf: Literal["lower", "middle", "upper"] = "middle",
+        leaf: Literal["lower", "middle", "upper"] = "lower",
+        method: Method = "bounds",
+        trials: int = 20,
+        reuse: bool = True,
     ) -> None:
+        self.model, self.method, self.reuse = model, method, reuse
+        self.simulations, self.depth, self.time_limit = simulations, depth, time_limit
+        self._planted: np.ndarray | None = None
+        if method == "bounds":
+            self._bounds = solve(model, gap=_START_GAP, time_limit=1e9, max_trials=trials).bounds
+            self._beliefs, self._spare = self._room(), self._room()
+            return
         lower, upper = leaf_values(model)
         if (lower > upper + 1e-6).any():
             worst = int((lower - upper).argmax())
@@ -103,60 +106,125 @@ class TreeSearch:
                 f"lower bound above upper bound in state '{model.states[worst]}'", RuntimeWarning, stacklevel=2
             )
         weight = {"lower": 0.0, "middle": 0.5, "upper": 1.0}[leaf]
-        self.model, self.packed = model, pack(model, (1 - weight) * lower + weight * upper)
-        self.simulations, self.depth, self.time_limit = simulations, depth, time_limit
+        self._packed, self._blind = pack(model, (1 - weight) * lower + weight * upper), blind_policies(model)
         self.exploration = float(np.ptp(model.reward)) if exploration is None else exploration
-        self.tree = allocate(simulations + 2, len(model.actions))
+        num_actions = len(model.actions)
+        self.tree = allocate(2 * simulations + 2, num_actions)
         self._bits = stream(rng)
+
+    def _room(self) -> BeliefTree:
+        num_actions, num_observations = len(self.model.actions), len(self.model.observations)
+        nodes = self.simulations * num_actions * min(num_observations, 4) + num_actions * num_observations + 1
+        nodes = min(nodes, 4_000_000)
+        entries = min((self.simulations + 1) * len(self.model.states), 8_000_000)
+        return bound_search.allocate(nodes, entries, num_actions, num_observations)
 
     def plan(self, belief: np.ndarray, allowed: np.ndarray | None = None) -> tuple[int, dict[str, Any]]:
         """Choose an action.
 
         Args:
             belief: float64 [S], sums to 1.
-            allowed: bool [A], actions that a shield leaves; all by default.
+            allowed: bool [A], actions that a shield leaves; all by default. The others are not tried at the root.
 
         Returns:
-            The action, and what the search saw: values, visits, simulations, nodes, mean and greatest depth.
+            The action, and what the search saw: values and visits per action, simulations, nodes, mean and greatest
+            depth, `lower` and `upper` bound of the belief's value, and for `bounds` those of each action.
         """
         mask = np.ones(len(self.model.actions), np.bool_) if allowed is None else np.asarray(allowed, np.bool_)
         if not mask.any():
             raise ValueError("a search needs at least one allowed action")
-        clear(self.tree)
-        support = np.flatnonzero(belief > 0)
-        cumulative = np.cumsum(belief[support])
-        cumulative /= cumulative[-1]
-        depths = np.zeros(2, np.int64)
+        if self.method == "bounds":
+            return self._plan_with_bounds(belief, mask)
+        return self._plan_by_walks(belief, mask)
+
+    def update(self, action: int, observation: int) -> bool:
+        """Keep the part of the tree that lies below what happened, for the next `plan`; whether there was any."""
+        if not self.reuse or self._planted is None:
+            return False
+        before, self._planted = self._planted, None
+        if self.method == "bounds":
+            kept = bound_search.reroot(self._beliefs, action, observation, self._spare)
+            if kept:
+                self._beliefs, self._spare = self._spare, self._beliefs
+        else:
+            kept = reroot(self.tree, action, observation)
+        if kept:
+            self._planted = self.model.update(before, action, observation)
+        return bool(kept)
+
+    def draw(self, depth: int = 3, format: Literal["dot", "svg"] = "dot") -> str:
+        """The tree of the last `plan`, down to `depth` steps, as DOT or SVG text."""
+        names = (list(self.model.actions), list(self.model.observations))
+        return drawing_of(self._beliefs if self.method == "bounds" else self.tree, *names, depth, format)
+
+    def _kept(self, belief: np.ndarray, mask: np.ndarray) -> bool:
+        """Whether the tree at hand was grown for this belief, and its root has tried nothing that is forbidden."""
+        if self._planted is None or not np.allclose(self._planted, belief, atol=1e-9):
+            return False
+        return bool(mask.all())
+
+    def _plan_with_bounds(self, belief: np.ndarray, mask: np.ndarray) -> tuple[int, dict[str, Any]]:
+        arrays, flat = self._bounds.arrays, self._bounds.flat
+        if not self._kept(belief, mask):
+            bound_search.plant(self._beliefs, arrays, *sparse_belief(belief), self._bounds.dense)
+        self._planted = belief if mask.all() else None
+        tree = self._beliefs
+        before = tree.visits[0]
         started, done = time.perf_counter(), 0
-        chunk = _CHUNK if self.time_limit > 0 else self.simulations
+        chunk = 8 if self.time_limit > 0 else self.simulations
         while done < self.simulations:
             if self.time_limit > 0 and done and time.perf_counter() - started >= self.time_limit:
                 break
-            count = min(chunk, self.simulations - done)
-            _simulate(
-                self.packed,
-                self.tree,
-                support,
-                cumulative,
-                count,
-                self.depth,
-                self.model.discount,
-                self.exploration,
-                mask,
-                self._bits,
-                depths,
-            )
+            count = bound_search.grow(flat, arrays, tree, min(chunk, self.simulations - done), mask, _TOLERANCE)
             done += count
-        visits, values = self.tree.q_visits[0].copy(), self.tree.q_value[0].copy()
-        action = int(np.where(visits > 0, values, -np.inf).argmax())
+            if count < chunk:
+                break
+        if tree.visits[0] == 0:  # an end, where any allowed action will do
+            return int(mask.argmax()), {"values": [0.0] * len(mask), "visits": [0] * len(mask), "simulations": 0}
+        low, high = tree.q_lower[0].copy(), tree.q_upper[0].copy()
+        if (low[mask] > high[mask] + 1e-6).any():
+            warnings.warn("lower bound above upper bound in the search tree", RuntimeWarning, stacklevel=3)
+        action = int(np.where(mask, low, -np.inf).argmax())
+        size = int(tree.size[0])
+        visits = np.zeros(len(mask), np.int64)
+        for a in np.flatnonzero(mask):
+            children = tree.child[0, a]
+            visits[a] = 1 + tree.visits[children[children >= 0]].sum()
+        expanded = tree.visits[:size] > 0
         return action, {
-            "values": values.tolist(),
+            "values": low.tolist(),
+            "upper_values": high.tolist(),
             "visits": visits.tolist(),
-            "simulations": done,
-            "nodes": int(self.tree.size[0]),
-            "mean_depth": float(depths[0] / max(done, 1)),
-            "max_depth": int(depths[1]),
+            "simulations": int(tree.visits[0] - before),
+            "nodes": size,
+            "mean_depth": float(tree.depth[:size][expanded].mean() + 1),
+            "max_depth": int(tree.depth[:size].max()),
+            "lower": float(low.max()),
+            "upper": float(high.max()),
         }
+
+    def _plan_by_walks(self, belief: np.ndarray, mask: np.ndarray) -> tuple[int, dict[str, Any]]:
+        if not self._kept(belief, mask):
+            clear(self.tree)
+        self._planted = belief if mask.all() else None
+        support, value = sparse_belief(belief)
+        start = TabularBelief(support, np.cumsum(value) / value.sum())
+        info = walks(
+            self._packed,
+            start,
+            self.tree,
+            self.simulations,
+            self.time_limit,
+            self.depth,
+            self.model.discount,
+            self.exploration,
+            True,
+            mask,
+            self._bits,
+        )
+        info["lower"] = float((self._blind @ belief).max())
+        info["upper"] = float((self.model.fully_observed @ belief).max())
+        return best_tried(info, mask), info
 
 
 def closed_loop(search: TreeSearch, steps: int, rng: np.random.Generator) -> float:
@@ -172,59 +240,39 @@ def closed_loop(search: TreeSearch, steps: int, rng: np.random.Generator) -> flo
         total += factor * reward
         factor *= model.discount
         belief = model.update(belief, action, seen)
+        search.update(action, seen)
     return total
 
 
-@njit(cache=True)
-def _simulate(
-    model: PackedPOMDP,
-    tree: Tree,
-    support: np.ndarray,
-    cumulative: np.ndarray,
-    count: int,
-    depth: int,
-    discount: float,
-    exploration: float,
-    allowed: np.ndarray,
-    bits: np.ndarray,
-    depths: np.ndarray,
-) -> None:
-    nodes = np.zeros(depth, np.int64)
-    actions = np.zeros(depth, np.int64)
-    rewards = np.zeros(depth)
-    everything = np.ones(allowed.shape[0], np.bool_)
-    last = model.observation.shape[2] - 1
-    for _ in range(count):
-        number = uniform(bits)
-        low, high = 0, support.shape[0] - 1
-        while low < high:
-            half = (low + high) // 2
-            if number < cumulative[half]:
-                high = half
-            else:
-                low = half + 1
-        state = support[low]
-        node, length, value = 0, 0, 0.0
-        while length < depth and not model.terminal[state]:
-            action = best_by_ucb(tree, node, exploration, allowed if node == 0 else everything)
-            nodes[length], actions[length], rewards[length] = node, action, model.reward[action, state]
-            length += 1
-            entry, end = model.begin[action, state], model.begin[action, state + 1]
-            number = uniform(bits)
-            while entry < end - 1 and number >= model.cumulative[entry]:
-                entry += 1
-            state = model.successor[entry]
-            number = uniform(bits)
-            seen = 0
-            while seen < last and number >= model.observation[action, state, seen]:
-                seen += 1
-            value = model.leaf[state]
-            node = find_child(tree, node, action, seen, True)
-            if node < 0:
-                break
-        if model.terminal[state]:
-            value = 0.0
-        leaf = -node - 1 if -tree.size[0] <= node < 0 else -1
-        backup_best(tree, nodes, actions, rewards, length, leaf, value, discount)
-        depths[0] += length
-        depths[1] = max(depths[1], length)
+def exact_return(search: TreeSearch, least: float = 1e-6) -> float:
+    """Expected discounted return of acting on `search` from the model's start: all that can be observed, weighed.
+
+    Each belief (to 9 digits) is planned for once, so a search that draws nothing is valued exactly; what is worth
+    less than `least` of the reward's range is left out.
+
+    Args:
+        search: with `reuse` off, or on: beliefs are planned for one by one, nothing is kept from one to another.
+        least: discount^depth x chance below which a branch is cut.
+    """
+    model = search.model
+    chosen: dict[bytes, int] = {}
+    total, layer = 0.0, {b"": (1.0, model.start)}
+    while layer:
+        after: dict[bytes, tuple[float, np.ndarray]] = {}
+        for weight, belief in layer.values():
+            key = np.round(belief, 9).tobytes()
+            if key not in chosen:
+                chosen[key] = search.plan(belief)[0]
+            action = chosen[key]
+            total += weight * float(model.reward[action] @ belief)
+            for o, chance in enumerate(model.observation_chances(belief, action)):
+                if model.discount * weight * chance < least:
+                    continue
+                then = model.update(belief, action, o)
+                if model.terminal[then > 0].all():
+                    continue
+                name = np.round(then, 9).tobytes()
+                share = model.discount * weight * float(chance)
+                after[name] = (after[name][0] + share if name in after else share, then)
+        layer = after
+    return total

@@ -13,6 +13,8 @@ import numpy as np
 
 from nesy.compiled import njit
 
+NO_CHILD = -9223372036854775807
+"""What `find_child` answers where there is no child, or no room for one."""
 _EMPTY = np.int64(-1)
 _MULTIPLIER = np.uint64(0x9E3779B97F4A7C15)
 
@@ -102,7 +104,7 @@ def find_child(tree: Tree, node: int, action: int, observation: int, add: bool) 
     """The child of `node` by (action, observation).
 
     With `add`, a missing child is made; the answer is then -(index) - 1. Otherwise a missing child, or one that
-    no longer fits into the tree, is answered with the smallest integer.
+    no longer fits into the tree, is answered with `NO_CHILD`.
     """
     num_actions = tree.q_value.shape[1]
     owner = node * num_actions + action
@@ -115,7 +117,7 @@ def find_child(tree: Tree, node: int, action: int, observation: int, add: bool) 
             return tree.child[slot]
         slot = (slot + np.uint64(1)) & mask
     if not add or tree.size[0] >= tree.visits.shape[0]:
-        return -9223372036854775807
+        return NO_CHILD
     made = tree.size[0]
     tree.size[0] = made + 1
     tree.owner[slot], tree.key[slot], tree.child[slot] = owner, observation, made
@@ -178,3 +180,49 @@ def backup_best(
                 best = tree.q_value[node, a]
         tree.value[node] = best
         before, after = old, best * (tree.visits[node] + 1)
+
+
+@njit(cache=True)
+def reroot(tree: Tree, action: int, observation: int) -> bool:
+    """Keep only what lies below (action, observation) of the root, which becomes the root.
+
+    False, and the tree is as before, where there is nothing below.
+    """
+    top = find_child(tree, 0, action, observation, False)
+    if top < 0 or tree.visits[top] == 0:
+        return False
+    num_actions = tree.q_value.shape[1]
+    used = tree.size[0]
+    owner, key = np.full(used, -1, np.int64), np.zeros(used, np.int64)
+    for slot in range(tree.owner.shape[0]):
+        if tree.owner[slot] != -1:
+            owner[tree.child[slot]], key[tree.child[slot]] = tree.owner[slot], tree.key[slot]
+            tree.owner[slot] = -1
+    place = np.full(used, -1, np.int64)
+    place[top] = 0
+    size, depth = 0, tree.depth[top]
+    for node in range(top, used):  # children come after their parents, so nothing is overwritten before it is moved
+        if node != top:
+            if owner[node] < 0 or place[owner[node] // num_actions] < 0:
+                continue
+            place[node] = size
+        new = size
+        size += 1
+        tree.visits[new], tree.value[new] = tree.visits[node], tree.value[node]
+        tree.depth[new] = tree.depth[node] - depth
+        for a in range(num_actions):
+            tree.q_visits[new, a], tree.q_value[new, a] = tree.q_visits[node, a], tree.q_value[node, a]
+            tree.gained[new, a], tree.future[new, a] = tree.gained[node, a], tree.future[node, a]
+    for node in range(size, used):
+        tree.visits[node], tree.depth[node] = 0, 0
+        for a in range(num_actions):
+            tree.q_visits[node, a], tree.q_value[node, a] = 0, 0.0
+            tree.gained[node, a], tree.future[node, a] = 0.0, 0.0
+    tree.size[0] = 1
+    for node in range(top + 1, used):
+        if place[node] > 0:
+            up = place[owner[node] // num_actions]
+            tree.size[0] = place[node]
+            find_child(tree, up, owner[node] % num_actions, key[node], True)
+    tree.size[0] = size
+    return True

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from domains.classic import rocksample, tiger
 from nesy.errors import UserError
 from planners.point_based import solve
 from planners.pomdp import TabularPOMDP
-from planners.search import TreeSearch, closed_loop
+from planners.search import Method, TreeSearch, closed_loop, exact_return
 
 TIGER_FILE = """
 # the tiger, in the compact form of the literature
@@ -77,13 +78,36 @@ def test_tiger_is_certified() -> None:
     assert certificate.action(np.array([0.99, 0.01])) == 2
 
 
-def test_rocksample_shape() -> None:
-    model = TabularPOMDP(**rocksample(4, 4))
-    assert len(model.states) == 257
+def test_rocksample_is_that_of_the_literature() -> None:
+    arrays = rocksample(4, 4)
+    model = TabularPOMDP(**arrays)
+    assert (len(model.states), len(model.actions), len(model.observations)) == (257, 9, 2)
+    assert model.states[model.start.argmax()].startswith("s02")
     assert model.terminal.sum() == 1
-    assert model.fully_observed.max(axis=0) @ model.start == pytest.approx(23.1, abs=5.0)
+    north, east, sample = (model.actions.index(name) for name in ("amn", "ame", "as"))
+    rock, edge = model.states.index("s131111"), model.states.index("s301111")
+    assert model.reward[sample, rock] == 10
+    assert model.reward[sample, model.states.index("s131101")] == -10
+    assert model.transition[sample][rock, model.states.index("s131101")] == 1
+    assert model.reward[east, edge] == 10
+    assert model.reward[north, rock] == model.reward[sample, edge] == -100
+    check = model.observation[model.actions.index("ac2")]
+    assert check[rock].tolist() == [1, 0]
+    assert check[model.states.index("s121111"), 0] == pytest.approx((1 + np.exp(-1)) / 2)
     with pytest.raises(ValueError, match="layouts are known"):
         rocksample(3, 2)
+
+
+@pytest.mark.parametrize(
+    ("size", "rocks", "gap", "value"),
+    # The bounds at the published instances; sources in domains/classic/rocksample.py.
+    [(4, 4, 0.1, 17.925), (5, 5, 2.6, 19.237)],
+)
+def test_rocksample_is_bracketed(size: int, rocks: int, gap: float, value: float) -> None:
+    certificate = solve(TabularPOMDP(**rocksample(size, rocks)), gap=gap, time_limit=60)
+    assert certificate.lower - 1e-3 <= value <= certificate.upper + 1e-3
+    assert certificate.lower >= 0.95 * value
+    assert certificate.upper - certificate.lower <= gap
 
 
 def test_compact_file_is_the_built_in_tiger(tmp_path: Path) -> None:
@@ -156,26 +180,73 @@ def test_terminal_states_must_be_terminal() -> None:
         TabularPOMDP(**arrays)
 
 
-def test_search_plays_tiger_as_the_solver_does() -> None:
+@pytest.mark.parametrize("method", ["bounds", "po-uct"])
+def test_search_plays_tiger_as_the_solver_does(method: Method) -> None:
     model = TabularPOMDP(**tiger())
     certificate = solve(model, gap=0.05, time_limit=30)
-    search = TreeSearch(model, np.random.default_rng(0), simulations=4000, depth=20)
+    search = TreeSearch(model, np.random.default_rng(0), simulations=4000, depth=20, method=method)
     for hints in range(-3, 4):  # net number of times the tiger was heard on the left
         belief = model.start
         for _ in range(abs(hints)):
             belief = model.update(belief, 0, 0 if hints > 0 else 1)
         action, info = search.plan(belief)
         assert action == certificate.action(belief)
-        # Leaves are worth more than a belief-bound player can get, so the estimate is high, but within bounds.
-        assert (certificate.alphas @ belief).max() - 3 <= max(info["values"]) <= model.fully_observed.max()
-    returns = [closed_loop(search, 60, np.random.default_rng(seed)) for seed in range(8)]
-    assert np.mean(returns) > 0
+        assert max(info["values"]) <= certificate.at(belief)[1] + 1e-6
+        assert info["lower"] <= certificate.at(belief)[1] + 1e-6
+        assert info["upper"] >= certificate.at(belief)[0] - 1e-6
 
 
-def test_search_repeats_and_respects_the_mask() -> None:
+def test_closed_loop_of_the_search_is_worth_the_optimum() -> None:
     model = TabularPOMDP(**tiger())
-    plans = [TreeSearch(model, np.random.default_rng(4), simulations=500).plan(model.start) for _ in range(2)]
+    assert exact_return(TreeSearch(model, np.random.default_rng(0), simulations=100)) == pytest.approx(19.371, abs=2e-3)
+    search = TreeSearch(model, np.random.default_rng(0), simulations=50)
+    assert np.mean([closed_loop(search, 60, np.random.default_rng(seed)) for seed in range(8)]) > 0
+
+
+def test_search_on_rocksample_lies_in_the_bracket() -> None:
+    model = TabularPOMDP(**rocksample(4, 4))
+    value = exact_return(TreeSearch(model, np.random.default_rng(0), simulations=30, reuse=False), least=1e-3)
+    assert 0.95 * 17.925 <= value <= 17.93
+
+
+@pytest.mark.parametrize("method", ["bounds", "po-uct"])
+def test_search_repeats_and_respects_the_mask(method: Method) -> None:
+    model = TabularPOMDP(**tiger())
+
+    def search() -> TreeSearch:
+        return TreeSearch(model, np.random.default_rng(4), simulations=500, method=method)
+
+    plans = [search().plan(model.start) for _ in range(2)]
     assert plans[0] == plans[1]
-    action, info = TreeSearch(model, np.random.default_rng(4)).plan(model.start, np.array([False, True, True]))
+    action, info = search().plan(model.start, np.array([False, True, True]))
     assert action != 0
     assert info["visits"][0] == 0
+    with pytest.raises(ValueError, match="at least one allowed action"):
+        search().plan(model.start, np.zeros(3, np.bool_))
+
+
+@pytest.mark.parametrize("method", ["bounds", "po-uct"])
+def test_the_tree_below_what_happened_is_kept_and_can_be_drawn(method: Method) -> None:
+    model = TabularPOMDP(**rocksample(4, 4))
+    search = TreeSearch(model, np.random.default_rng(0), simulations=300, method=method, exploration=20.0)
+    action, _ = search.plan(model.start)
+    seen = int(model.observation_chances(model.start, action).argmax())
+    belief = model.update(model.start, action, seen)
+    fresh = TreeSearch(model, np.random.default_rng(0), simulations=300, method=method, exploration=20.0)
+    assert search.update(action, seen)
+    _, kept = search.plan(belief)
+    _, alone = fresh.plan(belief)
+    assert sum(kept["visits"]) > sum(alone["visits"])
+    assert not fresh.update(action, 1 - seen)  # a move is always followed by "ogood"
+    dot, svg = search.draw(2), search.draw(2, "svg")
+    assert dot.startswith("digraph")
+    assert " / ogood" in dot
+    assert ElementTree.fromstring(svg).tag.endswith("svg")
+
+
+def test_warns_when_a_lower_bound_exceeds_an_upper_one() -> None:
+    model = TabularPOMDP(**tiger())
+    search = TreeSearch(model, np.random.default_rng(0), simulations=5)
+    search._bounds.arrays.blind[:] = 1e6
+    with pytest.warns(RuntimeWarning, match="lower bound above upper bound"):
+        search.plan(model.start)
