@@ -11,6 +11,7 @@ import argparse
 import dataclasses
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 
 import gymnasium
@@ -18,14 +19,12 @@ import gymnasium
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from domains.person_following.variants import VARIANTS, parameters_of
-from tests.domains.play import compare_play
+from tests.domains.play import PLAYERS, compare_play
 from tests.domains.reference import Reference
-
-PLAYERS = ("random", "greedy", "mixed", "adversarial")
 
 
 def main() -> None:
-    """Play and print how often each outcome came."""
+    """Play and print how often each outcome and each rare event came."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=100_000, help="steps per variant, all players together")
     parser.add_argument("--variants", nargs="+", choices=sorted(VARIANTS), default=list(VARIANTS))
@@ -34,14 +33,13 @@ def main() -> None:
     for variant in arguments.variants:
         started = time.monotonic()
         rules = dataclasses.asdict(parameters_of(variant))
-        outcomes: dict[str, int] = {}
+        counts: Counter[str] = Counter()
         for player in PLAYERS:
             env = gymnasium.make("nesy/PersonFollowing-v0", variant=variant)
-            found = compare_play(env, Reference(None, **rules), player, arguments.steps // len(PLAYERS), arguments.seed)
-            for outcome, count in found.items():
-                outcomes[outcome] = outcomes.get(outcome, 0) + count
+            steps = arguments.steps // len(PLAYERS)
+            counts += compare_play(env, Reference(None, **rules), player, steps, arguments.seed)
         seconds = time.monotonic() - started
-        print(f"{variant}: {arguments.steps} steps, no difference, {seconds:.0f} s; {outcomes}", flush=True)
+        print(f"{variant}: {arguments.steps} steps, no difference, {seconds:.0f} s; {dict(counts)}", flush=True)
 
 
 if __name__ == "__main__":

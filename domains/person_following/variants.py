@@ -178,7 +178,7 @@ _INTENT = _OCCLUDED | {
     "goal_patience": 0,
     "max_steps": 60,
 }
-_FALSE_BELIEF = _INTENT | {"num_goals": 2, "goal_moves_at": 3, "max_lost": 3, "goal_patience": 4}
+_FALSE_BELIEF = _INTENT | {"num_goals": 2, "goal_moves_at": 3, "max_lost": 3, "goal_patience": 4, "robot_rest": 5}
 VARIANTS: dict[str, dict[str, Any]] = {
     "paper": {},
     "clean": _CLEAN,

@@ -169,6 +169,10 @@ class Reference:
     def observe(self):
         return view_of(self.shown(), self.agent, self.view_size, self.see_through_walls), self.configuration()
 
+    def goal_hidden(self):
+        """Whether the robot sees the person on a goal cell, which it then does not see."""
+        return self.grid[self.person[0]][self.person[1]] == 2 and self.configuration() != 0
+
     def person_view(self):
         return view_of(self.grid, self.person, self.view_size, self.see_through_walls)
 
