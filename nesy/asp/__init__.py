@@ -7,7 +7,7 @@ from typing import Any
 
 _WHERE = {
     "Answer": "nesy.asp.solver",
-    "Finding": "nesy.asp.knowledge",
+    "Finding": "nesy.asp.finding",
     "KnowledgeBase": "nesy.asp.knowledge",
     "VOCABULARY": "nesy.asp.facts",
 }

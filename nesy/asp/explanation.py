@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from nesy.asp.finding import Edge, graph_of
 from nesy.dbn.inference import most_probable_next
 from nesy.dbn.model import TwoSliceDBN
 
@@ -64,16 +65,19 @@ class Explanation:
 
     _names: tuple[str, ...] = ()
 
+    @property
+    def support(self) -> list[Edge]:
+        """The parents' values behind each value, as edges."""
+        return [
+            (f"{name} = {value}", f"{s.factor}' = {s.value}", f"{s.probability:.3g}, met {s.count}")
+            for s in self.supports
+            for name, value in s.parents
+        ]
+
     def graph(self) -> networkx.DiGraph:
         """Nodes `X1 = 3` and `X1' = 3`; edges from the parents' values to the value they decide."""
-        import networkx
-
-        graph = networkx.DiGraph(action=self.action, probability=self.probability)
-        for s in self.supports:
-            node = f"{s.factor}' = {s.value}"
-            graph.add_node(node, probability=s.probability, count=s.count)
-            for name, value in s.parents:
-                graph.add_edge(f"{name} = {value}", node)
+        graph = graph_of(self.support)
+        graph.add_nodes_from(f"{s.factor}' = {s.value}" for s in self.supports)
         return graph
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import clingo
+import numpy as np
 
 from nesy.asp.encoding import run_encoding
 from nesy.asp.facts import Facts, asp_name
@@ -13,6 +14,10 @@ from nesy.dbn.codebook import Codebook
 from nesy.errors import UserError
 
 MOST_LINES = 8
+SYMBOLS = (".", "#", "G", "~")
+"""Of the cell kinds empty, wall, goal and unseen."""
+CLEAR = 0.95
+"""Share of the views in which a cell is of one kind for the picture to show it."""
 
 Rows = list[dict[str, Any]]
 
@@ -189,3 +194,18 @@ def _percent(share: float) -> int:
 
 def _percentage(part: int, whole: int) -> str:
     return f"{100 * part / max(1, whole):.1f} %"
+
+
+def mean_view(book: Codebook, factor: int, value: int) -> str:
+    """The views with a value, laid over each other, in characters; the viewer stands at the bottom, looking up."""
+    views = book.views[book.codes[:, factor] == value]
+    kinds = len(book.cell_kinds)
+    shares = (views[..., None] == np.arange(kinds)).mean(axis=0)
+    lines = []
+    for y in range(views.shape[2]):
+        cells = [
+            SYMBOLS[int(shares[x, y].argmax())] if shares[x, y].max() >= CLEAR else "?" for x in range(views.shape[1])
+        ]
+        lines.append("    " + " ".join(cells))
+    legend = ", ".join(f"{symbol} {kind}" for symbol, kind in zip(SYMBOLS, book.cell_kinds, strict=False))
+    return "\n".join([*lines, f"    ({legend}; ? differs between the views)"])

@@ -130,7 +130,7 @@ def find_plan(
         raise UserError("a plan needs a goal")
     if truth is None and codebook is not None and len(codebook):
         truth = PredicateTruth(codebook)
-    codes, moves, distance = _reachable(dbn, start, max_steps, truth, optimistic)
+    codes, moves, distance = reachable(dbn, start, max_steps, truth, optimistic)
     good = satisfied(literals, codes, truth)
     left = _steps_left(moves, good, max_steps)
     sources = read_sources(list(rules))
@@ -181,7 +181,7 @@ def _steps_left(moves: Sequence[_Move], good: np.ndarray, max_steps: int) -> np.
     return left
 
 
-def _reachable(
+def reachable(
     dbn: TwoSliceDBN, start: np.ndarray, max_steps: int, truth: PredicateTruth | None, optimistic: bool
 ) -> tuple[np.ndarray, list[_Move], np.ndarray]:
     """Codes and moves that most probable (or hoped for) outcomes lead to within some steps.
