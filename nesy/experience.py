@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from domains.core import CELL_KINDS, OUTCOMES
 from nesy.errors import UserError
 from nesy.run_folder import atomic_path
 
@@ -212,6 +213,16 @@ def count_rows(path: Path) -> int | None:
     return int(metadata.num_rows) if names == set(COLUMNS) else None
 
 
+# What later steps index with must not lead anywhere else.
+_RANGES: dict[str, tuple[int, int]] = {
+    **dict.fromkeys(_VIEWS, (0, len(CELL_KINDS) - 1)),
+    **dict.fromkeys(("configuration", "next_configuration"), (0, (1 << 15) - 1)),
+    "action": (0, 63),
+    "person_action": (-1, 63),
+    "outcome": (0, len(OUTCOMES) - 1),
+}
+
+
 def parts_of(folder: Path | str) -> list[Path]:
     """The parts of a folder of experience, in the order of their names.
 
@@ -276,6 +287,9 @@ def _values(path: Path, name: str, column: pa.Array, side: int, count: int) -> n
         values = column.to_numpy(zero_copy_only=False)
     if len(values) != count or values.dtype == object:
         raise UserError(f"{path}: damaged, column {name} has missing values")
+    lowest, highest = _RANGES.get(name, (None, None))
+    if lowest is not None and len(values) and (values.min() < lowest or values.max() > highest):
+        raise UserError(f"{path}: damaged, column {name} holds a value outside {lowest}..{highest}")
     return np.asarray(values)
 
 
@@ -290,6 +304,8 @@ def _read_part(path: Path, sources: set[str] | None, names: Sequence[str]) -> di
         raise _damaged(path, error) from None
     source, number = np.zeros(0, dtype="U20"), np.zeros(0, dtype=np.int8)
     if "source" in table.column_names:
+        if table["source"].null_count:
+            raise UserError(f"{path}: damaged, column source has missing values")
         indexed = table["source"].unify_dictionaries().combine_chunks()
         known, place = np.asarray(indexed.dictionary.to_pylist(), dtype="U20"), indexed.indices.to_numpy()
         number = np.array([SOURCES.index(name) if name in SOURCES else -1 for name in known], dtype=np.int8)[place]

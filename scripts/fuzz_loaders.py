@@ -180,6 +180,8 @@ def mutate(path: Path, content: bytes, rng: np.random.Generator, canary: Path) -
         kinds += [("json", lambda: _json(path, content, rng))] * 4
     if path.suffix == ".npz":
         kinds += [("array", lambda: _npz(content, rng))] * 3
+    if path.suffix == ".parquet":
+        kinds += [("column", lambda: _column(content, rng))] * 3
     if path.suffix == ".safetensors":
         kinds += [("header", lambda: _header(content, rng))] * 3
     if path.suffix in (".lp", ".pomdp"):
@@ -293,6 +295,34 @@ def _npz(content: bytes, rng: np.random.Generator) -> bytes:
             member = io.BytesIO()
             np.lib.format.write_array(member, np.ascontiguousarray(value), allow_pickle=False)
             archive.writestr(f"{key}.npy", member.getvalue())
+    return buffer.getvalue()
+
+
+def _column(content: bytes, rng: np.random.Generator) -> bytes:
+    """One Parquet column renamed, dropped, doubled, of another type, or with other values."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(io.BytesIO(content))
+    i = int(rng.integers(table.num_columns))
+    name, column = table.column_names[i], table.column(i)
+    kind = int(rng.integers(5))
+    if kind == 0:
+        table = table.drop_columns([name])
+    elif kind == 1:
+        table = table.rename_columns([f"{n}x" if j == i else n for j, n in enumerate(table.column_names)])
+    elif kind == 2:
+        table = table.set_column(i, name, pa.array([str(_AWKWARD[int(rng.integers(6))])] * table.num_rows))
+    elif kind == 3:
+        table = table.set_column(i, name, pa.nulls(table.num_rows, column.type))
+    elif pa.types.is_integer(column.type) or pa.types.is_floating(column.type):
+        values = column.to_numpy().copy()
+        values[rng.integers(len(values), size=3)] = (0, 100, 127)[int(rng.integers(3))]
+        table = table.set_column(i, name, pa.array(values, column.type))
+    else:
+        table = table.slice(0, int(rng.integers(table.num_rows)))
+    buffer = io.BytesIO()
+    pq.write_table(table, buffer)
     return buffer.getvalue()
 
 
