@@ -66,12 +66,15 @@ class JointRoll:
     def __init__(self, packed: PackedModel, model: Meaning, threshold: float = THRESHOLD) -> None:
         self.packed, self.model, self.threshold = packed, model, threshold
         self._rollout = Rollout(packed, threshold)
-        self._sorted, self._number = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+        # By number: key, factors' values and view of a code; by number and action: where its successors are, -1 for
+        # not yet looked up. All but the slots of the numbering are longer than what they hold, so that they seldom
+        # have to be copied.
+        self._count, self._taken = 0, 0
+        self._slots = np.full(1 << 12, -1, dtype=np.int64)
         self._keys = np.zeros(0, dtype=np.int64)
         self._digits = np.zeros((0, packed.num_factors), dtype=np.uint8)
         self._views = np.zeros((0, 0), dtype=np.uint8)
-        self._first = np.zeros(0, dtype=np.int64)  # by code and action; -1 where not yet expanded
-        self._last = np.zeros(0, dtype=np.int64)
+        self._first, self._last = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
         self._then, self._chance = np.zeros(0, dtype=np.int64), np.zeros(0)
 
     def __call__(self, views: np.ndarray, beliefs: np.ndarray, trees: Trees, nodes: Levels) -> Believed:
@@ -109,29 +112,70 @@ class JointRoll:
         wanted = _unexpanded(before, action, ends, code, self._first, size)
         if not len(wanted):
             return
-        codes = self._rollout.codes(self._keys[wanted // size])
-        cuts, then, chance = successors(self.packed, codes, wanted % size, self.threshold)
+        cuts, then, chance = successors(self.packed, self._digits[wanted // size], wanted % size, self.threshold)
         number = self._numbers(code_keys(then, self.packed.num_values))
-        self._first[wanted], self._last[wanted] = cuts[:-1] + len(self._then), cuts[1:] + len(self._then)
-        self._then, self._chance = np.concatenate([self._then, number]), np.concatenate([self._chance, chance])
+        first, self._taken = self._taken, self._taken + len(number)
+        self._first[wanted], self._last[wanted] = cuts[:-1] + first, cuts[1:] + first
+        self._then, self._chance = _room(self._then, self._taken), _room(self._chance, self._taken)
+        self._then[first : self._taken], self._chance[first : self._taken] = number, chance
 
     def _numbers(self, keys: np.ndarray) -> np.ndarray:
         """The numbers of code keys; new ones are numbered and decoded."""
-        distinct, place = np.unique(keys, return_inverse=True)
-        new = distinct[~np.isin(distinct, self._sorted, assume_unique=True)]
-        if len(new):
-            digits = self._rollout.codes(new)
-            views = self.model.views(digits).reshape(len(new), -1)
-            self._digits = np.concatenate([self._digits, digits])
-            self._views = np.concatenate([self._views.reshape(len(self._keys), views.shape[1]), views])
-            room = np.full(len(new) * self.packed.num_actions, -1, dtype=np.int64)
-            self._first, self._last = np.concatenate([self._first, room]), np.concatenate([self._last, room])
-            every = np.concatenate([self._sorted, new])
-            number = np.concatenate([self._number, len(self._keys) + np.arange(len(new))])
-            order = np.argsort(every)
-            self._sorted, self._number = every[order], number[order]
-            self._keys = np.concatenate([self._keys, new])
-        return self._number[np.searchsorted(self._sorted, distinct)][place]
+        most = self._count + len(keys)
+        if 2 * most > len(self._slots):
+            self._slots = np.full(1 << (4 * most).bit_length(), -1, dtype=np.int64)
+            _number(self._keys[: self._count], self._slots, self._keys, 0)
+        self._keys = _room(self._keys, most)
+        first = self._count
+        numbers, self._count = _number(keys, self._slots, self._keys, first)
+        if self._count > first:
+            digits = self._rollout.codes(self._keys[first : self._count])
+            views = self.model.views(digits).reshape(len(digits), -1)
+            self._digits = _room(self._digits, self._count)
+            self._views = _room(self._views if first else np.zeros((0, views.shape[1]), np.uint8), self._count)
+            self._digits[first : self._count], self._views[first : self._count] = digits, views
+            size = self.packed.num_actions
+            self._first, self._last = _room(self._first, self._count * size), _room(self._last, self._count * size)
+            self._first[first * size : self._count * size] = -1
+        return numbers
+
+
+def _room(array: np.ndarray, count: int) -> np.ndarray:
+    """The array with room for `count` rows; what was in it is kept."""
+    if count <= len(array):
+        return array
+    grown = np.zeros((2 * count, *array.shape[1:]), dtype=array.dtype)
+    grown[: len(array)] = array
+    return grown
+
+
+@njit(cache=True)
+def _number(keys: np.ndarray, slots: np.ndarray, known: np.ndarray, count: int) -> tuple[np.ndarray, int]:
+    """Number keys, by a hash table with linear probing.
+
+    Args:
+        keys: int64 [n].
+        slots: int64, a power of two of them, the numbers by hash; -1 where free. Gets the new ones.
+        known: int64, the keys by number, with room for new ones.
+        count: how many are known.
+
+    Returns:
+        The numbers int64 [n], and how many are known then.
+    """
+    mask = len(slots) - 1
+    numbers = np.empty(len(keys), dtype=np.int64)
+    for i in range(len(keys)):
+        key = keys[i]
+        mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+        slot = np.int64(mixed >> np.uint64(20)) & mask
+        while slots[slot] >= 0 and known[slots[slot]] != key:
+            slot = (slot + 1) & mask
+        if slots[slot] < 0:
+            slots[slot] = count
+            known[count] = key
+            count += 1
+        numbers[i] = slots[slot]
+    return numbers, count
 
 
 @njit(cache=True)

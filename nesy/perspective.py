@@ -29,7 +29,7 @@ from nesy.world_model.successors import Factored, PackedModel, pack
 
 INFLUENCE_MODES = ("zero", "random", "egocentric", "perspective-shift", "perfect-information")
 PLANNERS = ("table", "network")
-BLOCK = 512
+BLOCK = 1024
 """Beliefs whose trees of walks are gone through at once, to bound the memory that their distributions take."""
 
 
@@ -164,7 +164,7 @@ class PerspectiveShift:
             raise UserError("this world model has no tables; shift with planner 'network', or extract a 2DBN first")
         self.model = model
         self._joint = None if packed is None else JointRoll(packed, model)
-        self._keys = np.zeros(0, dtype=np.int64)
+        self._keys, self._place = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
         self._memory = _Walked.nowhere(0, model.num_factors, model.num_values)
 
     def __call__(self, beliefs: np.ndarray, configurations: np.ndarray) -> Shift:
@@ -190,9 +190,7 @@ class PerspectiveShift:
         """Shift certain beliefs in codes [C, N] to every configuration, to be remembered; returns how many pairs."""
         codes = np.asarray(codes, dtype=np.uint8)
         everywhere = np.arange(1, 4 * self.model.views(codes[:1])[0].size + 1)
-        for first in range(0, len(codes), BLOCK):
-            block = codes[first : first + BLOCK]
-            self._remembered(np.repeat(block, len(everywhere), axis=0), np.tile(everywhere, len(block)))
+        self._remembered(np.repeat(codes, len(everywhere), axis=0), np.tile(everywhere, len(codes)))
         return len(codes) * len(everywhere)
 
     def imagine(self, belief: np.ndarray, configuration: int) -> ImaginedPath:
@@ -221,11 +219,13 @@ class PerspectiveShift:
             _, root, row = np.unique(new >> 16, return_index=True, return_inverse=True)
             certain = np.eye(self.model.num_values, dtype=np.float32)[codes[root]]
             walked = self._walk(certain, codes[root], row, new & 0xFFFF)
-            order = np.argsort(np.concatenate([self._keys, new]), kind="stable")
-            self._keys = np.concatenate([self._keys, new])[order]
-            self._memory = self._memory.joined(walked).take(order)
+            every = np.concatenate([self._keys, new])
+            order = np.argsort(every, kind="stable")  # two sorted runs, which a stable sort merges
+            self._keys = every[order]
+            self._place = np.concatenate([self._place, len(self._place) + np.arange(len(new))])[order]
+            self._memory = self._memory.joined(walked)
             index = np.searchsorted(self._keys, keys)
-        return index
+        return self._place[index]
 
     def _walk(self, beliefs: np.ndarray, codes: np.ndarray, rows: np.ndarray, configurations: np.ndarray) -> _Walked:
         """Walk from beliefs [R, N, K] with likeliest codes [R, N] to configurations [Q], all of them seen.
@@ -274,6 +274,8 @@ class _Walked:
         return _Walked(self.beliefs[rows], self.lengths[rows], self.codes[rows])
 
     def joined(self, other: _Walked) -> _Walked:
+        if not len(self.lengths):
+            return other
         return _Walked(
             np.concatenate([self.beliefs, other.beliefs]),
             np.concatenate([self.lengths, other.lengths]),

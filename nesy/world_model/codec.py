@@ -27,10 +27,12 @@ class _Memo:
         return index, self.keys[index] == keys
 
     def add(self, keys: np.ndarray, rows: np.ndarray) -> None:
-        """Add new distinct keys."""
-        if self.keys is not None and self.rows is not None:
-            keys, rows = np.concatenate([self.keys, keys]), np.concatenate([self.rows, rows])
-        order = np.argsort(keys)
+        """Add new distinct keys, in ascending order."""
+        if self.keys is None or self.rows is None:
+            self.keys, self.rows = keys, rows
+            return
+        keys, rows = np.concatenate([self.keys, keys]), np.concatenate([self.rows, rows])
+        order = np.argsort(keys, kind="stable")  # two sorted runs, which a stable sort merges
         self.keys, self.rows = keys[order], rows[order]
 
 
