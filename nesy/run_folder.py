@@ -8,6 +8,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,6 +21,8 @@ from nesy.errors import UserError
 _UMASK = os.umask(0o022)
 os.umask(_UMASK)
 _FILE_MODE = 0o666 & ~_UMASK
+_TEMPORARY = re.compile(r"\..*\.\d+\.tmp(\.[^.]*)?")
+"""Names that `atomic_path` gives to files that are being written."""
 
 
 @contextmanager
@@ -195,4 +198,11 @@ class RunFolder:
             stream.truncate(0)
             stream.write(f"process {os.getpid()}")
             stream.flush()
+            self._remove_left_behind()
             yield
+
+    def _remove_left_behind(self) -> None:
+        """Remove what a killed writer left under a temporary name (see `atomic_path`); needs the lock."""
+        for path in self.path.rglob(".*.tmp*"):
+            if path.is_file() and _TEMPORARY.fullmatch(path.name):
+                path.unlink(missing_ok=True)

@@ -7,6 +7,7 @@ when their command is called, so `nesy --help` answers at once.
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib
 import io
 import json
@@ -92,6 +93,11 @@ def _run(name: str, arguments: list[str]) -> int:
     except KeyboardInterrupt:
         print(f"nesy {name}: interrupted; the same command goes on where it stopped", file=sys.stderr)
         return 130
+    except Exception as error:
+        reason = _cannot_write(error)
+        if reason is None:
+            raise
+        return _mistake(f"{reason}; make room, and the same command goes on where it stopped")
     finally:
         signal.signal(signal.SIGTERM, before)
     return 0
@@ -145,6 +151,26 @@ def _did_you_mean(name: str) -> str:
 def _mistake(message: str) -> int:
     print("nesy: " + " ".join(message.split()), file=sys.stderr)
     return 2
+
+
+def _cannot_write(error: BaseException) -> str | None:
+    """Why a file could not be written, where that is the reason of an error; libraries say it in many ways."""
+    full = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
+    causes: list[BaseException] = [error]
+    while (cause := causes[-1].__cause__ or causes[-1].__context__) is not None and cause not in causes:
+        causes.append(cause)
+    for cause in causes:
+        number = getattr(cause, "errno", None)
+        if isinstance(number, int) and number in full:
+            where = getattr(cause, "filename", None)
+            return f"{where}: cannot be written ({os.strerror(number)})" if where else os.strerror(number)
+        text = str(cause)
+        found = next((n for n in full if os.strerror(n) in text or f"os error {n}" in text), None)
+        if found is not None:
+            return os.strerror(found)
+        if isinstance(cause, OSError) and "requested and" in text and "written" in text:  # numpy's way
+            return os.strerror(errno.ENOSPC)
+    return None
 
 
 def _interrupt(signum: int, frame: FrameType | None) -> None:
