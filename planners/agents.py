@@ -63,8 +63,8 @@ class DQNAgent:
 class Planner(Protocol):
     """Chooses an action for a belief, int16 [P, 2N + 5]."""
 
-    def plan(self, belief: np.ndarray) -> tuple[int, dict[str, object]]:
-        """The action, and what the search saw."""
+    def plan(self, belief: np.ndarray, allowed: np.ndarray | None = None) -> tuple[int, dict[str, object]]:
+        """The action among those `allowed`, bool [A] (all by default), and what the search saw."""
         ...
 
 
@@ -98,7 +98,9 @@ class PlanningAgent:
                 belief.reset(percepts.codes[i], pose, percepts.shifted[i])
             else:
                 belief.update(int(situation.last_actions[i]), percepts.codes[i], pose, percepts.shifted[i])
-            actions[i], self.infos[i] = self.planners[i].plan(belief.states)
+            allowed = None if situation.allowed is None else situation.allowed[i]
+            actions[i], info = self.planners[i].plan(belief.states, allowed)
+            self.infos[i] = info | {"effective": belief.effective, "resets": belief.resets}
         return actions
 
     def _begin(self, count: int) -> None:

@@ -133,14 +133,15 @@ class LocalRewardModel(pomdp_py.RewardModel):
 
 
 class LocalPolicyModel(pomdp_py.RolloutPolicy):
-    """All actions, always, in a fixed order."""
+    """All actions, in a fixed order; at the root (an empty history) those that `allowed`, bool [A], leaves."""
 
-    def __init__(self, action_names: Sequence[str]) -> None:
+    def __init__(self, action_names: Sequence[str], allowed: np.ndarray | None = None) -> None:
         self.actions = [RobotAction(i, name) for i, name in enumerate(action_names)]
+        self.first = [action for action in self.actions if allowed is None or allowed[action.index]]
 
     def get_all_actions(self, state: Any = None, history: Any = None) -> list[RobotAction]:
         """The list of actions."""
-        return self.actions
+        return self.actions if history else self.first
 
     def sample(self, state: Any, history: Any = None) -> RobotAction:
         """A uniformly random action."""
@@ -173,10 +174,17 @@ class ParticleDistribution(pomdp_py.GenerativeDistribution):
 class RobotAgent(pomdp_py.Agent):
     """The robot: a belief and the models T, Z, R over the IALM."""
 
-    def __init__(self, model: IALM, compiled: kernels.Model, belief: np.ndarray, rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        model: IALM,
+        compiled: kernels.Model,
+        belief: np.ndarray,
+        rng: np.random.Generator,
+        allowed: np.ndarray | None = None,
+    ) -> None:
         super().__init__(
             ParticleDistribution(belief, rng),
-            LocalPolicyModel(model.dbn.action_names),
+            LocalPolicyModel(model.dbn.action_names, allowed),
             LocalTransitionModel(model, compiled, rng),
             LocalObservationModel(model.num_factors),
             LocalRewardModel(),
@@ -221,22 +229,26 @@ class POUCTAgent:
         self.root: Any = None
         """Root of the last search's tree, for pictures."""
 
-    def plan(self, belief: np.ndarray) -> tuple[int, dict[str, Any]]:
+    def plan(self, belief: np.ndarray, allowed: np.ndarray | None = None) -> tuple[int, dict[str, Any]]:
         """Choose an action.
 
         Args:
             belief: int16 [P, 2N + 5], equally weighted particles.
+            allowed: bool [A], actions that a shield leaves; all by default. The others are not tried at the root.
 
         Returns:
             The action, and what the search saw: values and visits per action, simulations.
         """
-        agent = RobotAgent(self.model, self.compiled, belief, self.rng)
+        if allowed is not None and not np.any(allowed):
+            raise ValueError("a search needs at least one allowed action")
+        agent = RobotAgent(self.model, self.compiled, belief, self.rng, allowed)
         action = self.planner.plan(agent)
         self.root = agent.tree
         children = agent.tree.children
-        order = sorted(children, key=lambda a: a.index)
+        found = {a.index: node for a, node in children.items()}
+        names = range(len(self.model.dbn.action_names))
         return action.index, {
-            "values": [float(children[a].value) for a in order],
-            "visits": [int(children[a].num_visits) for a in order],
+            "values": [float(found[a].value) if a in found else 0.0 for a in names],
+            "visits": [int(found[a].num_visits) if a in found else 0 for a in names],
             "simulations": int(self.planner.last_num_sims),
         }

@@ -71,8 +71,23 @@ def test_same_seed_same_plan_and_masks_hold() -> None:
     action, info = IALMSearch(model, compiled, CONFIG, np.random.default_rng(3)).plan(_beliefs(), only)
     assert only[action]
     assert info["visits"][1] == info["visits"][2] == 0
-    with pytest.raises(ValueError, match="at least one allowed action"):
-        IALMSearch(model, compiled, CONFIG, np.random.default_rng(3)).plan(_beliefs(), np.zeros(4, np.bool_))
+    theirs, seen = POUCTAgent(model, compiled, CONFIG, np.random.default_rng(3)).plan(_beliefs(), only)
+    assert only[theirs]
+    assert seen["visits"][1] == seen["visits"][2] == 0 < seen["visits"][3]
+    for planner in (IALMSearch, POUCTAgent):
+        with pytest.raises(ValueError, match="at least one allowed action"):
+            planner(model, compiled, CONFIG, np.random.default_rng(3)).plan(_beliefs(), np.zeros(4, np.bool_))
+
+
+def test_the_tree_can_be_drawn() -> None:
+    model = small_ialm(0)
+    search = IALMSearch(model, kernels.compile_model(model), CONFIG, np.random.default_rng(3))
+    _, info = search.plan(_beliefs())
+    assert 1 < info["distinct"] <= 200
+    assert "forward" in search.draw(1)
+    assert search.draw(2, "svg").count("<rect") > 4
+    with pytest.raises(ValueError, match="'dot' or 'svg'"):
+        search.draw(1, "png")  # type: ignore[arg-type]
 
 
 def test_terminal_states_stay_and_earn_nothing() -> None:
