@@ -116,13 +116,16 @@ def known_part(dbn: TwoSliceDBN, least: float = 0.0) -> TwoSliceDBN:
         counts.append([])
         for i in range(dbn.num_factors):
             arity = len(dbn.parents(a, i))
-            inner = (slice(0, k),) * arity
+            inner: tuple[slice, ...] = (slice(0, k),) * arity
             visits = np.zeros((k + 1,) * arity, dtype=np.int64)
             visits[inner] = dbn.counts(a, i).reshape((k,) * arity)
-            kept = np.where(dbn.tensor(a, i) >= least, dbn.tensor(a, i), 0.0) * (visits[inner] > 0)[..., None]
+            tensor = dbn.tensor(a, i)
+            keep = (tensor >= least) & (visits[inner] > 0)[..., None]
             table = np.zeros((k + 1,) * (arity + 1))
-            table[(*inner, slice(0, k))] = kept
-            table[..., k] = np.maximum(0.0, 1.0 - table.sum(axis=-1))
+            table[..., k] = 1.0
+            table[(*inner, slice(0, k))] = np.where(keep, tensor, 0.0)
+            # the sum of what is dropped, not 1 less what is kept: rounding must not lead anywhere
+            table[(*inner, k)] = np.where(keep, 0.0, tensor).sum(axis=-1)
             tables[-1].append(table.reshape(-1, k + 1))
             counts[-1].append(visits.reshape(-1))
     meanings = [[*texts, ELSEWHERE] for texts in dbn.value_meanings]

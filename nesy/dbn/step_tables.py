@@ -165,6 +165,17 @@ class StepTable:
         table.check(factors, num_values, actions)
         return table
 
+    def plain(self) -> dict[str, Any]:
+        """All of it as JSON values."""
+        arrays = {k: {"dtype": array.dtype.str, "values": array.tolist()} for k, array in self.arrays().items()}
+        return {"document": self.document(), "arrays": arrays}
+
+    @classmethod
+    def from_plain(cls, value: dict[str, Any], model: tuple[int, int, int]) -> StepTable:
+        """What `plain` wrote; errors as `restore`."""
+        arrays = {k: np.array(a["values"], dtype=np.dtype(str(a["dtype"]))) for k, a in value["arrays"].items()}
+        return cls.restore(value["document"], arrays, model)
+
     def check(self, factors: int, num_values: int, actions: int) -> None:
         """Whether the table fits a model.
 

@@ -13,19 +13,18 @@ from nesy.run_folder import atomic_path
 
 def write(dbn: TwoSliceDBN, path: Path) -> None:
     """Write `dbn` to the file `path`."""
-    k = dbn.num_values
-    values = ", ".join(map(str, range(k)))
     every = list(nodes(dbn))
     with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as stream:
         stream.write("network dbn { }\n")
         for node in every:
-            stream.write(f"variable {node.name} {{ type discrete [ {k} ] {{ {values} }}; }}\n")
+            values = ", ".join(map(str, range(node.size)))
+            stream.write(f"variable {node.name} {{ type discrete [ {node.size} ] {{ {values} }}; }}\n")
         for node in every:
             if not node.parents:
                 stream.write(f"probability ( {node.name} ) {{ table {_numbers(node.tensor)}; }}\n")
                 continue
             stream.write(f"probability ( {node.name} | {', '.join(node.parents)} ) {{\n")
-            table = node.tensor.reshape(-1, k)
+            table = node.tensor.reshape(-1, node.size)
             for context, row in zip(np.ndindex(*node.tensor.shape[:-1]), table, strict=True):
                 stream.write(f"  ({', '.join(map(str, context))}) {_numbers(row)};\n")
             stream.write("}\n")

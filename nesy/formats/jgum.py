@@ -1,10 +1,12 @@
 """jgum, pyAgrum's JSON format: one Bayesian network with a copy of slice t+1 per action; bit-equal when read back.
 
-Written and read here without pyAgrum, which the core does not need.
+Written and read here without pyAgrum, which the core does not need. The last property is the SHA-256 of everything
+before it, so that any damaged byte is found.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -12,11 +14,13 @@ from typing import Any
 import numpy as np
 
 from nesy.dbn.model import TwoSliceDBN
+from nesy.dbn.step_tables import StepTable
 from nesy.errors import UserError
 from nesy.formats.bayes_nodes import node_names, nodes
 from nesy.run_folder import atomic_path, read_json
 
 PROPERTY = "nesy-2dbn"
+SEAL, END = ', "sha256": "', '"}}\n'
 
 
 def write(dbn: TwoSliceDBN, path: Path) -> None:
@@ -25,7 +29,7 @@ def write(dbn: TwoSliceDBN, path: Path) -> None:
     parents: dict[str, list[str]] = {}
     tables: dict[str, str] = {}
     for node in nodes(dbn):
-        names.append(f"{node.name}[{dbn.num_values}]")
+        names.append(f"{node.name}[{node.size}]")
         parents[node.name] = list(node.parents)
         # pyAgrum's order: the node's own value runs fastest, then its first parent, ...
         axes = (*range(len(node.parents) - 1, -1, -1), len(node.parents))
@@ -42,13 +46,23 @@ def write(dbn: TwoSliceDBN, path: Path) -> None:
         "provenance": dbn.provenance,
         "met": [met.tolist(), dbn.row_counts[met].tolist()],
         "tables": {name: {"dtype": t.dtype.str, "values": t.tolist()} for name, t in dbn.tables.items()},
+        "step_tables": {name: table.plain() for name, table in dbn.step_tables.items()},
     }
     properties = {"name": "2DBN", "software": "nesy", PROPERTY: json.dumps(document)}
     head = {"type": "BN", "GumJsonVersion": "1.0", "nodes": names, "parents": parents}
-    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as stream:
-        stream.write(json.dumps(head)[:-1] + ', "cpt": {')
-        stream.write(", ".join(f"{json.dumps(name)}: {table}" for name, table in tables.items()))
-        stream.write('}, "properties": ' + json.dumps(properties) + "}\n")
+    digest = hashlib.sha256()
+    with atomic_path(path) as temporary, temporary.open("wb") as stream:
+
+        def put(text: str) -> None:
+            content = text.encode("utf-8")
+            digest.update(content)
+            stream.write(content)
+
+        put(json.dumps(head)[:-1] + ', "cpt": {')
+        for position, (name, table) in enumerate(tables.items()):
+            put(f"{', ' if position else ''}{json.dumps(name)}: {table}")
+        put('}, "properties": ' + json.dumps(properties)[:-1] + SEAL)
+        stream.write((digest.hexdigest() + END).encode())
 
 
 def read(path: Path) -> TwoSliceDBN:
@@ -62,12 +76,20 @@ def read(path: Path) -> TwoSliceDBN:
         document = json.loads(content["properties"][PROPERTY])
     except (KeyError, TypeError, ValueError, RecursionError):
         raise UserError(f"{path}: not a jgum file of a 2DBN (its property '{PROPERTY}' is missing)") from None
+    _check_seal(path)
     try:
         return _build(document, content)
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
-    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError) as error:
         raise UserError(f"{path}: not a readable jgum file of a 2DBN ({error!r})") from None
+
+
+def _check_seal(path: Path) -> None:
+    content = path.read_bytes()
+    place = content.rfind(SEAL.encode()) + len(SEAL)
+    if hashlib.sha256(content[:place]).hexdigest() + END != content[place:].decode("utf-8", "replace"):
+        raise UserError(f"{path}: damaged (its checksum does not match its content); export the model again")
 
 
 def _build(document: dict[str, Any], content: dict[str, Any]) -> TwoSliceDBN:
@@ -111,6 +133,10 @@ def _build(document: dict[str, Any], content: dict[str, Any]) -> TwoSliceDBN:
         tables={
             str(name): np.array(entry["values"], dtype=np.dtype(str(entry["dtype"])))
             for name, entry in document["tables"].items()
+        },
+        step_tables={
+            str(name): StepTable.from_plain(value, (len(factors), k, len(actions)))
+            for name, value in document["step_tables"].items()
         },
     )
 

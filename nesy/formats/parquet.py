@@ -1,11 +1,13 @@
 """Parquet: one row per action, factor, parents' values and value, with probability and count; bit-equal.
 
 Columns: `action`, `factor` (names), `parents` (list of names; a stroke marks slice t+1), `parent_values` (list),
-`value`, `probability`, `count`. What the columns do not hold is JSON in the file's metadata (`nesy-2dbn`).
+`value`, `probability`, `count`. What the columns do not hold is JSON in the file's metadata (`nesy-2dbn`), with a
+SHA-256 of the model beside it, so that no damage passes as another model.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 from dataclasses import fields
 from pathlib import Path
@@ -16,11 +18,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from nesy.dbn.model import TwoSliceDBN
+from nesy.dbn.step_tables import StepTable
 from nesy.errors import UserError
 from nesy.formats.long_table import Part, parts
 from nesy.run_folder import atomic_path
 
-KEY = b"nesy-2dbn"
+KEY, SUM = b"nesy-2dbn", b"nesy-2dbn-sha256"
+_DAMAGE = (pa.ArrowException, OSError, ValueError, KeyError, TypeError, RecursionError, IndexError, AttributeError)
 _TEXTS = ("factor_names", "action_names", "num_values", "order", "parents_now", "parents_next", "value_meanings")
 
 
@@ -31,10 +35,19 @@ def write(dbn: TwoSliceDBN, path: Path) -> None:
     document["tables"] = {
         name: {"dtype": table.dtype.str, "values": table.tolist()} for name, table in dbn.tables.items()
     }
-    schema = _schema(dbn).with_metadata({KEY: json.dumps(document).encode()})
+    document["step_tables"] = {name: table.plain() for name, table in dbn.step_tables.items()}
+    text = json.dumps(document).encode()
+    schema = _schema(dbn).with_metadata({KEY: text, SUM: _digest(text, dbn.probabilities, dbn.row_counts).encode()})
     with atomic_path(path) as temporary, pq.ParquetWriter(temporary, schema, compression="zstd") as writer:
         for part in parts(dbn):
             writer.write_table(_table(dbn, part, schema))
+
+
+def _digest(text: bytes, probabilities: np.ndarray, counts: np.ndarray) -> str:
+    digest = hashlib.sha256(text)
+    for array in (probabilities, counts):
+        digest.update(np.ascontiguousarray(array).view(np.uint8).reshape(-1).data)
+    return digest.hexdigest()
 
 
 def _schema(dbn: TwoSliceDBN) -> pa.Schema:
@@ -90,12 +103,23 @@ def read(path: Path) -> TwoSliceDBN:
             raise UserError(f"{path}: a Parquet file, but not of a 2DBN (metadata '{KEY.decode()}' is missing)")
         document = json.loads(metadata[KEY])
         dbn = _build(document, table)
+        if _digest(metadata[KEY], dbn.probabilities, dbn.row_counts).encode() != metadata.get(SUM):
+            raise UserError(f"{path}: damaged (its checksum does not match its content); export the model again")
+        _check_keys(dbn, table, path)
     except UserError as error:
         raise UserError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
-    except (pa.ArrowException, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (
+        pa.ArrowException,
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        RecursionError,
+        IndexError,
+        AttributeError,
+    ) as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(f"{path}: not a readable Parquet file of a 2DBN ({reason})") from None
-    _check_keys(dbn, table, path)
     return dbn
 
 
@@ -116,6 +140,10 @@ def _build(document: dict[str, Any], table: pa.Table) -> TwoSliceDBN:
         tables={
             str(name): np.array(entry["values"], dtype=np.dtype(str(entry["dtype"])))
             for name, entry in document["tables"].items()
+        },
+        step_tables={
+            str(name): StepTable.from_plain(value, (len(document["factor_names"]), k, len(document["action_names"])))
+            for name, value in document["step_tables"].items()
         },
     )
 

@@ -1,7 +1,9 @@
 """RDDL for pyRDDLGym: every table is a non-fluent indexed by the parents' values.
 
 Rows are many and RDDL is read slowly, so above `MAX_ENTRIES` only the rows met in experience are written; all
-others are then uniform, and the file says so.
+others are then uniform, and the file says so. Where the model has them, the reward is a table of step means, and the
+state fluent `done` becomes true with the termination table's probability; rows of these two that were never met pay
+nothing and end nothing.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from nesy.dbn.model import TwoSliceDBN
+from nesy.dbn.step_tables import StepTable
 from nesy.errors import UserError
 from nesy.formats.bayes_nodes import identifier
 from nesy.run_folder import atomic_path
@@ -50,6 +53,13 @@ def _domain(dbn: TwoSliceDBN, actions: list[str]) -> str:
         for i in range(dbn.num_factors):
             types = ", ".join(["val"] * (len(dbn.parents(a, i)) + 1))
             lines.append(f"    p_{a}_{i}({types}) : {{ non-fluent, real, default = {1.0 / dbn.num_values:.17f} }};")
+    for name, table in _outcomes(dbn).items():
+        for a in range(dbn.num_actions):
+            types = ", ".join(["val"] * len(table.parents(a, 0)))
+            kind = f"({types})" if types else ""
+            lines.append(f"    {name}_{a}{kind} : {{ non-fluent, real, default = 0.0 }};")
+    if "termination" in dbn.step_tables:
+        lines.append("    done : { state-fluent, bool, default = false };")
     lines += [f"    x{i} : {{ state-fluent, val, default = @v0 }};" for i in range(dbn.num_factors)]
     lines += [f"    {action} : {{ action-fluent, bool, default = false }};" for action in actions]
     lines += ["  };", "  cpfs {"]
@@ -61,7 +71,43 @@ def _domain(dbn: TwoSliceDBN, actions: list[str]) -> str:
             index = ", ".join([*parents, "?v"])
             branches = f"if ({actions[a]}) then Discrete_{{?v : val}}(p_{a}_{i}({index})) else ({branches})"
         lines.append(f"    x{i}' = {branches};")
-    return "\n".join([*lines, "  };", "  reward = 0;", "}"]) + "\n"
+    ends = "termination" in dbn.step_tables
+    if ends:
+        branches = _by_action(dbn, actions, "ends", "Bernoulli({})", "false")
+        lines.append(f"    done' = if (done) then true else ({branches});")
+    pay = _by_action(dbn, actions, "pays", "{}", "0.0") if "reward" in dbn.step_tables else "0"
+    lines += ["  };", f"  reward = {pay};"]
+    return "\n".join([*lines, *(["  termination { done; };"] if ends else []), "}"]) + "\n"
+
+
+def _outcomes(dbn: TwoSliceDBN) -> dict[str, StepTable]:
+    """Step tables of the file by the name of their non-fluents."""
+    names = {"pays": "reward", "ends": "termination"}
+    return {name: dbn.step_tables[table] for name, table in names.items() if table in dbn.step_tables}
+
+
+def _by_action(dbn: TwoSliceDBN, actions: list[str], name: str, form: str, otherwise: str) -> str:
+    """An expression that looks a step table up for the action taken."""
+    branches = otherwise
+    for a in reversed(range(dbn.num_actions)):
+        parents = [f"x{p}" + ("'" if where else "") for where, p in _outcomes(dbn)[name].parents(a, 0)]
+        index = f"({', '.join(parents)})" if parents else ""
+        branches = f"if ({actions[a]}) then {form.format(f'{name}_{a}{index}')} else ({branches})"
+    return branches
+
+
+def _entries(dbn: TwoSliceDBN) -> list[str]:
+    """The numbers of the step tables that are not 0."""
+    lines = []
+    for name, table in _outcomes(dbn).items():
+        for a in range(dbn.num_actions):
+            column = -1 if table.outcomes else 0
+            values, shape = table.table(a, 0)[:, column], (dbn.num_values,) * len(table.parents(a, 0))
+            for row in np.flatnonzero((table.counts(a, 0) > 0) & (np.abs(values) > 1e-9)).tolist():
+                index = ", ".join(f"@v{v}" for v in np.unravel_index(row, shape)) if shape else ""
+                place = f"({index})" if index else ""
+                lines.append(f"    {name}_{a}{place} = {np.format_float_positional(values[row])};")
+    return lines
 
 
 def _instance(dbn: TwoSliceDBN, code: np.ndarray, horizon: int, every: bool) -> str:
@@ -75,6 +121,7 @@ def _instance(dbn: TwoSliceDBN, code: np.ndarray, horizon: int, every: bool) -> 
                 for k, p in enumerate(table[row].tolist()):
                     index = ", ".join(f"@v{v}" for v in (*context, k))
                     lines.append(f"    p_{a}_{i}({index}) = {np.format_float_positional(p)};")
+    lines += _entries(dbn)
     start = " ".join(f"x{i} = @v{int(v)};" for i, v in enumerate(code))
     lines += ["  };", "}", "instance start {", "  domain = dbn;", "  non-fluents = tables;"]
     lines += [f"  init-state {{ {start} }};", "  max-nondef-actions = 1;", f"  horizon = {horizon};"]
