@@ -28,6 +28,7 @@ COMMANDS = {
     "compare": "compare DQN, POMDP planner and references on the same maps",
     "report": "write report.html from the run folder",
     "bench": "measure speeds, each against a named peer in the same run",
+    "doctor": "check the installation and a run folder, say what to do",
     "play": "drive the robot in a terminal, watch a policy, record an episode",
 }
 
