@@ -67,9 +67,9 @@ class DQNConfig:
     """Which endings are only the clock's, so that the value of what would have followed counts."""
     target_period: int = 0
     """Updates between copies of the network into the target network; 0: it moves a little with every update (tau)."""
-    fallback: Literal["mode", "uniform", "published"] = "mode"
-    """What b~ is while the person is out of view: what the influence mode has; uniform in every mode; or, as in the
-    published code, zeros for perspective-shift and what the mode has for the others."""
+    fallback: Literal["uniform", "mode", "published"] = "uniform"
+    """What b~ is while the person is out of view: uniform in every mode; what the mode would have all the same (the
+    true code, say); or as in the published code: zeros for perspective-shift, what the mode has for the others."""
     checkpoint_seconds: float = 30.0
     """Seconds between the checkpoints that a stopped training goes on from; the results do not depend on it."""
     published_terminals: bool = False

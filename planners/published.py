@@ -3,7 +3,7 @@
 view, configuration -> (x, b, b~, configuration), as `planners.perception` makes them, and then:
 
     fallback             what b~ is where the person is out of view (`DQNConfig.fallback`)
-    published_sampling   b~ becomes a relaxed sample of itself (Gumbel softmax)
+    published_sampling   b~, where there is one, becomes a relaxed sample of itself (Gumbel softmax)
     published_occlusion  the person of `perfect-information` does not look through walls, whatever the task says
 
 The published code: arXiv 2503.20425, github.com/alcedok/SocialNav_paper (read, and run). There b is sampled as well;
@@ -15,6 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from domains.core import UNSEEN, WALL
+from nesy.perspective import InfluenceBelief
 from planners.config import DQNConfig
 from planners.perception import Codec, Perception, Percepts
 
@@ -23,7 +24,7 @@ TEMPERATURE = 0.6
 
 def dqn_perception(codec: Codec, influence: str, rng: np.random.Generator, config: DQNConfig) -> Perception:
     """The perception that the settings of a DQN ask for."""
-    if config.fallback == "mode" and not (config.published_sampling or config.published_occlusion):
+    if config.fallback == "uniform" and not (config.published_sampling or config.published_occlusion):
         return Perception(codec, influence, rng)
     return DQNPerception(codec, influence, rng, config)
 
@@ -33,6 +34,8 @@ class DQNPerception(Perception):
 
     def __init__(self, codec: Codec, influence: str, rng: np.random.Generator, config: DQNConfig) -> None:
         super().__init__(codec, influence, rng)
+        if config.fallback != "uniform":
+            self._shift = InfluenceBelief(influence, codec, rng, even_unseen=True)
         self.config, self.rng = config, rng
 
     def __call__(self, observation: dict[str, np.ndarray], person_views: np.ndarray) -> Percepts:
@@ -40,15 +43,12 @@ class DQNPerception(Perception):
         if self.config.published_occlusion:
             person_views = occluded(person_views)
         percepts = super().__call__(observation, person_views)
-        shifted, uniform = percepts.shifted, np.float32(1.0 / percepts.shifted.shape[-1])
+        nothing = (percepts.shifted == np.float32(1.0 / percepts.shifted.shape[-1])).all(axis=(1, 2), keepdims=True)
+        shifted = percepts.shifted
         if self.config.published_sampling:
-            shifted = relaxed_samples(shifted, TEMPERATURE, self.rng)
-        out_of_view = (percepts.configurations == 0)[:, None, None]
-        if self.config.fallback == "uniform":
-            shifted = np.where(out_of_view, uniform, shifted)
-        elif self.config.fallback == "published" and self.influence == "perspective-shift":
-            nothing = (percepts.shifted == uniform).all(axis=(1, 2), keepdims=True)
-            shifted = np.where(out_of_view | nothing, np.float32(0.0), shifted)
+            shifted = np.where(nothing, shifted, relaxed_samples(shifted, TEMPERATURE, self.rng))
+        if self.config.fallback == "published" and self.influence == "perspective-shift":
+            shifted = np.where(nothing, np.float32(0.0), shifted)
         return percepts._replace(shifted=shifted)
 
 

@@ -62,17 +62,14 @@ class Arguments:
     """Where the trainings run."""
     address: str | None = None
     """Address of the Ray cluster."""
-    dqn: DQNConfig = field(default_factory=lambda: replace(DQNConfig.fast(10_000), fallback="uniform"))
+    dqn: DQNConfig = field(default_factory=DQNConfig.fast)
     """How the DQN learns."""
 
 
 def defaults(arguments: list[str]) -> Arguments:
     """The options where the command line says nothing: those of the preset that it names."""
     named = next((name for name in PRESETS if f"--preset={name}" in arguments or _follows(arguments, name)), "fast")
-    dqn = PRESETS[named](10_000)
-    if named != "published":
-        dqn = replace(dqn, fallback="uniform")
-    return Arguments(dqn=dqn)
+    return Arguments(dqn=PRESETS[named](10_000))
 
 
 def _follows(arguments: list[str], name: str) -> bool:

@@ -2,14 +2,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from domains.core import FORWARD, load_domain
 from nesy.errors import UserError
 from planners.config import DQNConfig
-from planners.dqn import DQNPolicy, ValueNetwork, features
+from planners.dqn import DQNPolicy, Training, ValueNetwork, features, train
 from planners.memory import Replay
 from planners.perception import Percepts
 
@@ -84,3 +86,95 @@ def test_saved_policies_act_alike_and_damage_is_named(tmp_path: Path) -> None:
         DQNPolicy.load(path)
     with pytest.raises(UserError, match="no such policy"):
         DQNPolicy.load(tmp_path / "none.safetensors")
+
+
+class SumCodec:
+    """Codes from sums over the view: cheap, and telling enough to learn something."""
+
+    num_factors, num_values, num_actions, view_size = 3, 8, 4, 5
+
+    def codes(self, views: np.ndarray) -> np.ndarray:
+        flat = views.reshape(len(views), 25).astype(np.int64)
+        return np.stack([(flat * weights).sum(axis=1) % 8 for weights in np.arange(75).reshape(3, 25)], 1).astype(
+            np.uint8
+        )
+
+    def beliefs(self, views: np.ndarray) -> np.ndarray:
+        return np.eye(8, dtype=np.float32)[self.codes(views)]
+
+    def views(self, codes: np.ndarray) -> np.ndarray:
+        return np.zeros((len(codes), 5, 5), np.uint8)
+
+    def packed(self) -> None:
+        return None
+
+
+TINY = DQNConfig(
+    episodes=60, num_envs=8, hidden=(16,), batch_size=16, memory=400, warm_up=40, updates_per_step=0.5, n_step=2
+)
+
+
+def _trained(
+    influence: str = "random", config: DQNConfig = TINY, **options: Any
+) -> tuple[dict[str, Any], list[np.ndarray]]:
+    codec: Any = SumCodec()
+    policy, episodes = train(load_domain(), codec, "paper", influence, "paper", config, 3, **options)
+    return episodes, [value.detach().numpy() for value in policy.network.parameters()]
+
+
+def _same(one: tuple[dict[str, Any], list[np.ndarray]], other: tuple[dict[str, Any], list[np.ndarray]]) -> bool:
+    return all((one[0][name] == other[0][name]).all() for name in one[0]) and all(
+        (a == b).all() for a, b in zip(one[1], other[1], strict=True)
+    )
+
+
+@pytest.mark.parametrize("config", [TINY, replace(TINY, prioritised=True, target_period=7)])
+def test_a_stopped_training_goes_on_to_the_same_result(tmp_path: Path, config: DQNConfig) -> None:
+    undisturbed = _trained(config=config)
+    codec: Any = SumCodec()
+    training = Training(load_domain(), codec, "paper", "random", "paper", config, 3)
+    for _ in range(12):
+        training.step(training.choose())
+        training.learn()
+    assert training.updates > 0
+    training.save(tmp_path / "checkpoint.safetensors")
+    training.step(training.choose())  # lost: after the checkpoint
+    resumed = _trained(config=config, checkpoint=tmp_path / "checkpoint.safetensors")
+    assert _same(undisturbed, resumed)
+
+
+def test_a_checkpoint_of_another_training_or_a_damaged_one_is_not_used(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    _trained(config=replace(TINY, discount=0.5), checkpoint=path)
+    assert _same(_trained(), _trained(checkpoint=path))
+    path.write_bytes(path.read_bytes()[:200])
+    assert _same(_trained(), _trained(checkpoint=path))
+
+
+def test_rules_hold_while_exploring_and_acting() -> None:
+    def never_forward(codes: np.ndarray, configurations: np.ndarray) -> np.ndarray:
+        allowed = np.ones((len(codes), 4), np.bool_)
+        allowed[:, FORWARD] = False
+        return allowed
+
+    codec: Any = SumCodec()
+    training = Training(load_domain(), codec, "full", "zero", "paper", TINY, 0, never_forward)
+    while not training.over:
+        training.step(training.choose())
+        training.learn()
+    assert set(np.unique(np.array(training.actions))) == {0, 1, 3}
+    percepts = Percepts(np.zeros((5, 3), np.uint8), *[np.full((5, 3, 8), 1 / 8, np.float32)] * 2, np.zeros(5, np.int64))
+    assert (
+        training.policy().actions(percepts, never_forward(percepts.codes, percepts.configurations)) != FORWARD
+    ).all()
+
+
+def test_switches_of_the_published_code() -> None:
+    published = DQNConfig.published(100)
+    plain = _trained("perfect-information")
+    for name in ("published_terminals", "published_target_start", "published_occlusion"):
+        switched = replace(TINY, **{name: getattr(published, name)})
+        assert not _same(plain, _trained("perfect-information", switched)), name
+    assert published.published_sampling
+    assert not _same(plain, _trained("perfect-information", replace(TINY, fallback="mode")))
+    assert not _same(plain, _trained("perfect-information", replace(TINY, target_period=5)))
