@@ -12,6 +12,8 @@ from nesy.asp.facts import asp_name
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
 
+MOST_EXAMPLES = 20
+
 _ATOM = re.compile(r"impossible\((\w+),(\d+),\(([\d,]*)\),(\d+)\)$")
 
 
@@ -27,6 +29,8 @@ class Removal:
     """Largest probability that one row lost."""
     visits: float
     """Share of all visits in experience that fall on the rows changed."""
+    examples: tuple[tuple[str, str], ...] = ()
+    """Some of the atoms that named an entry, each with the row that it changed."""
 
 
 def remove_entries(dbn: TwoSliceDBN, atoms: Sequence[str]) -> tuple[TwoSliceDBN, Removal]:
@@ -38,6 +42,7 @@ def remove_entries(dbn: TwoSliceDBN, atoms: Sequence[str]) -> tuple[TwoSliceDBN,
     actions = [asp_name(name) for name in dbn.action_names]
     table = np.array(dbn.probabilities)
     touched = set()
+    examples: list[tuple[str, str]] = []
     for atom in atoms:
         match = _ATOM.match(atom)
         values = [int(v) for v in match[3].split(",") if v] if match else []
@@ -51,6 +56,8 @@ def remove_entries(dbn: TwoSliceDBN, atoms: Sequence[str]) -> tuple[TwoSliceDBN,
         row += int(np.ravel_multi_index(values, (dbn.num_values,) * len(values))) if values else 0
         table[row, int(match[4])] = 0.0
         touched.add(row)
+        if len(examples) < MOST_EXAMPLES:
+            examples.append((atom, _name(dbn, row)))
     rows = np.array(sorted(touched), dtype=np.int64)
     totals = table[rows].sum(axis=1)
     if (totals <= 0).any():
@@ -62,6 +69,7 @@ def remove_entries(dbn: TwoSliceDBN, atoms: Sequence[str]) -> tuple[TwoSliceDBN,
         rows=len(rows),
         largest=float(lost.max(initial=0.0)),
         visits=float(dbn.row_counts[rows].sum() / max(1, dbn.row_counts.sum())),
+        examples=tuple(examples),
     )
     return replace(dbn, probabilities=table), report
 

@@ -101,7 +101,7 @@ class KnowledgeBase(MeaningQuestions, StepQuestions):
         from nesy.asp.minds import persons_worlds
 
         started = time.perf_counter()
-        worlds = persons_worlds(self.dbn, self._book(), np.asarray(start), configuration, particles, seed)
+        worlds = persons_worlds(self.dbn, self.book, np.asarray(start), configuration, particles, seed)
         found = self.knows(worlds.particles, predicates)
         words = {"true": "the robot knows that the person sees it", "false": "the robot knows that the person does not"}
         lines = []
@@ -158,7 +158,7 @@ class KnowledgeBase(MeaningQuestions, StepQuestions):
         if not truth.knows(self.dbn._codes(code)[None].astype(np.uint8))[0]:
             raise UserError(f"code {tuple(int(v) for v in code)}: no view met has it, so its predicates are not known")
         holds, _ = truth.of(code[None])
-        columns = [self._book().predicate_names.index(name) for name in shield.predicates]
+        columns = [self.book.predicate_names.index(name) for name in shield.predicates]
         return shield.advise(code, holds[0, columns], configuration)
 
     def shield(self, rules: Sequence[str | Path], **options: Any) -> Shield:

@@ -11,6 +11,10 @@ from nesy.asp.subject import Subject
 from nesy.errors import UserError
 
 
+MOST_RULES = 3
+"""Of the rules for a value, the meaning shows so many."""
+
+
 class MeaningQuestions(Subject):
     """What values mean, in both directions, and what actions change."""
 
@@ -30,7 +34,7 @@ class MeaningQuestions(Subject):
         if not 0 <= value < self.dbn.num_values:
             raise UserError(f"no value {value}; the values of a factor are 0 to {self.dbn.num_values - 1}")
         name = f"{self.dbn.factor_names[f]} = {value}"
-        text, rows = meaning_of(self.facts, self._book(), f, value, least)
+        text, rows = meaning_of(self.facts, self.book, f, value, least)
         support: list[Edge] = [
             (name, row["predicate"] if row["relation"] == "means" else f"not {row['predicate']}", _share(row))
             for row in rows
@@ -38,7 +42,7 @@ class MeaningQuestions(Subject):
         ]
         if rows:
             rule, sentences = self._value_rule(f, value)
-            text = f"{text}\n{rule}\n{mean_view(self._book(), f, value)}"
+            text = f"{text}\n{rule}\n{mean_view(self.book, f, value)}"
             support = [(sentence, name, "rule") for sentence in sentences] + support
         return finding(f"What does {name} mean?", text, rows, started, support)
 
@@ -55,8 +59,8 @@ class MeaningQuestions(Subject):
         f = self.factor(factor)
         if not 0 <= value < self.dbn.num_values:
             raise UserError(f"no value {value}; the values of a factor are 0 to {self.dbn.num_values - 1}")
-        names = ordered(self._book().predicate_names)
-        found = value_rules(self._book(), f, value, held_out=held_out)
+        names = ordered(self.book.predicate_names)
+        found = value_rules(self.book, f, value, held_out=held_out)
         name = f"{self.dbn.factor_names[f]} = {value}"
         row = {
             "precision": found.precision,
@@ -75,11 +79,13 @@ class MeaningQuestions(Subject):
         from nesy.asp.rules import sentence
         from nesy.asp.semantics import ordered, value_rules
 
-        found = value_rules(self._book(), f, value, held_out=0.0)
-        names = ordered(self._book().predicate_names)
+        found = value_rules(self.book, f, value, held_out=0.0)
+        names = ordered(self.book.predicate_names)
         sentences = [sentence(rule, names, True) for rule in found.rules]
         exact = "exactly if" if found.accuracy == 1.0 else f"(right in {100 * found.accuracy:.1f} % of views) if"
-        return f"  it holds {exact} {'; or '.join(sentences) or 'never'}", sentences
+        shown = "; or ".join(sentences[:MOST_RULES]) or "never"
+        more = f"; or ... ({len(sentences) - MOST_RULES} more)" if len(sentences) > MOST_RULES else ""
+        return f"  it holds {exact} {shown}{more}", sentences
 
     def influenced(self, action: int | str) -> Finding:
         """Which factors does action A change, and through which parents?
@@ -104,7 +110,7 @@ class MeaningQuestions(Subject):
             UserError: no such predicate.
         """
         started = time.perf_counter()
-        text, rows = values_that_imply(self.facts, self._book(), predicate, least)
+        text, rows = values_that_imply(self.facts, self.book, predicate, least)
         support = [
             (" and ".join(f"{v['factor']} = {v['value']}" for v in row["values"]), predicate, _share(row))
             for row in rows
@@ -121,7 +127,7 @@ class MeaningQuestions(Subject):
         from nesy.asp.semantics import predicate_rules
 
         started = time.perf_counter()
-        found = predicate_rules(self._book(), predicate, held_out, num_values=self.dbn.num_values)
+        found = predicate_rules(self.book, predicate, held_out, num_values=self.dbn.num_values)
         row = {
             "precision": found.precision,
             "recall": found.recall,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from nesy.asp.facts import LEAST
 from nesy.asp.finding import Edge, Finding, finding
 from nesy.asp.meaning import MOST_LINES
 from nesy.asp.subject import Subject
@@ -22,7 +23,7 @@ class StepQuestions(Subject):
     """What actions lead to."""
 
     def verify(
-        self, action: int | str, premise: str, conclusion: str, codes: str = "all", least: float | None = None
+        self, action: int | str, premise: str, conclusion: str, codes: str = "all", least: float = LEAST
     ) -> Finding:
         """Does `conclusion` hold after every possible step of an action from a code with `premise`?
 
@@ -33,17 +34,17 @@ class StepQuestions(Subject):
             premise: conditions on the code before.
             conclusion: conditions on the code after, or `same`.
             codes: over `all` codes, or over those `met` in experience.
-            least: values of a row less probable than this are taken as impossible (0.001 by default).
+            least: values of a row less probable than this are taken as impossible.
 
         Raises:
             UserError: a wrong action or condition.
         """
         from nesy.asp.rules import sentence
-        from nesy.asp.verification import LEAST, verify
+        from nesy.asp.verification import verify
 
         started = time.perf_counter()
         a = self.action(action)
-        verdict = verify(self.dbn, self.codebook, a, premise, conclusion, codes, LEAST if least is None else least)
+        verdict = verify(self.dbn, self.codebook, a, premise, conclusion, codes, least)
         every = f"{self.dbn.num_values}^{self.dbn.num_factors} codes" if codes == "all" else "codes met"
         head = f"'{self.dbn.action_names[a]}' with [{premise or 'anything'}] leads to [{conclusion}]"
         names = self.dbn.factor_names
@@ -158,7 +159,7 @@ class StepQuestions(Subject):
         from nesy.asp.reachability import reach
 
         started = time.perf_counter()
-        goals = [goal] if goal else list(self._book().predicate_names)
+        goals = [goal] if goal else list(self.book.predicate_names)
         found = reach(self.dbn, self.codebook, self._truth_if_known(), np.asarray(start), goals, max_steps)
         lines, support = [], []
         for one in sorted(found.found, key=lambda r: (r.steps is None, r.steps or 0)):

@@ -50,7 +50,13 @@ class Subject:
             return action
         raise UserError(f"no action '{action}'; the actions are {', '.join(self.dbn.action_names)}")
 
-    def _book(self) -> Codebook:
+    @property
+    def book(self) -> Codebook:
+        """The codebook.
+
+        Raises:
+            UserError: this model has none.
+        """
         if self.codebook is None or not len(self.codebook):
             raise UserError("this model has no codebook: its values have no meaning in views")
         return self.codebook
@@ -60,7 +66,7 @@ class Subject:
         from nesy.asp.planning import PredicateTruth
 
         if self._known_truth is None:
-            self._known_truth = PredicateTruth(self._book())
+            self._known_truth = PredicateTruth(self.book)
         return self._known_truth
 
     def _truth_if_known(self) -> PredicateTruth | None:
