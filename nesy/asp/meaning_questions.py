@@ -10,7 +10,6 @@ from nesy.asp.meaning import changes_of, mean_view, meaning_of, values_that_impl
 from nesy.asp.subject import Subject
 from nesy.errors import UserError
 
-
 MOST_RULES = 3
 """Of the rules for a value, the meaning shows so many."""
 
