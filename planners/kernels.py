@@ -13,6 +13,7 @@ import numpy as np
 from nesy.compiled import njit
 from nesy.dbn.kernels import Packed
 from planners import ialm
+from planners.code_sampling import CodeSampler, next_code, sampler
 from planners.ialm import IALM
 from planners.random_bits import uniform
 from planners.tables import PackedTables, locate
@@ -25,6 +26,7 @@ class Model(NamedTuple):
     """The IALM in flat arrays."""
 
     dbn: Packed
+    codes: CodeSampler
     tables: PackedTables
     coefficients: np.ndarray
     next_heading: np.ndarray
@@ -35,6 +37,7 @@ def compile_model(model: IALM) -> Model:
     """The arrays of `model` for kernels."""
     return Model(
         model.packed_dbn,
+        sampler(model.packed_dbn),
         model.packed_tables,
         np.ascontiguousarray(model.motion.coefficients, np.int64),
         np.ascontiguousarray(model.motion.next_heading, np.int64),
@@ -60,27 +63,6 @@ def chance(tables: PackedTables, table: int, variables: np.ndarray, k: int) -> f
     node = locate(tables, table, variables)
     below = tables.estimate[node, k - 1] if k > 0 else 0.0
     return tables.estimate[node, k] - below
-
-
-@njit(cache=True)
-def next_code(
-    dbn: Packed, source: np.ndarray, start: int, action: int, target: np.ndarray, at: int, rng: np.ndarray
-) -> None:
-    """Draw target[at : at + N] from the 2DBN, given source[start : start + N] and the action."""
-    num_factors = dbn.order.shape[0]
-    last = dbn.cumulative.shape[1] - 1
-    for position in range(num_factors):
-        i = dbn.order[position]
-        row = dbn.offsets[action, i]
-        for j in range(dbn.num_parents[action, i]):
-            p = dbn.parents[action, i, j]
-            value = source[start + p] if p < num_factors else target[at + p - num_factors]
-            row += dbn.strides[action, i, j] * value
-        number = uniform(rng)
-        k = 0
-        while k < last and number >= dbn.cumulative[row, k]:
-            k += 1
-        target[at + i] = k
 
 
 @njit(cache=True)
@@ -150,7 +132,7 @@ def step(
     if action == FORWARD and draw(model.tables, ialm.MOVED, v, rng) == 0:
         motion = STAY
     v[b + ialm.MOTION] = motion
-    next_code(model.dbn, v, 0, motion, v, n, rng)
+    next_code(model.codes, v, 0, motion, v, n, rng)
     move_pose(model, v, b + ialm.SIDE, b + ialm.MID_SIDE, motion, WAIT)
     person = WAIT
     if draw(model.tables, ialm.WAITS, v, rng) == 0:
@@ -172,7 +154,7 @@ def finish(model: Model, v: np.ndarray, after: np.ndarray, rng: np.ndarray) -> t
     v[b + ialm.THE_OUTCOME] = outcome
     for i in range(n):
         after[i] = v[n + i]
-    next_code(model.dbn, v, 2 * n, v[b + ialm.PERSON], after, n, rng)
+    next_code(model.codes, v, 2 * n, v[b + ialm.PERSON], after, n, rng)
     for i in range(3):
         after[2 * n + i] = v[b + ialm.NEXT_SIDE + i]
     after[2 * n + 3] = draw(model.tables, ialm.NEXT_WAITING, v, rng)

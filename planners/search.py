@@ -94,7 +94,8 @@ class TreeSearch:
     ) -> None:
         self.model, self.method, self.reuse = model, method, reuse
         self.simulations, self.depth, self.time_limit = simulations, depth, time_limit
-        self._planted: np.ndarray | None = None
+        self._planted: np.ndarray | None = None  # the belief that the tree at hand was grown for
+        self._carried = False  # whether that tree is left over from an earlier belief
         if method == "bounds":
             self._bounds = solve(model, gap=_START_GAP, time_limit=1e9, max_trials=trials).bounds
             self._beliefs, self._spare = self._room(), self._room()
@@ -149,7 +150,7 @@ class TreeSearch:
         else:
             kept = reroot(self.tree, action, observation)
         if kept:
-            self._planted = self.model.update(before, action, observation)
+            self._planted, self._carried = self.model.update(before, action, observation), True
         return bool(kept)
 
     def draw(self, depth: int = 3, format: Literal["dot", "svg"] = "dot") -> str:
@@ -157,17 +158,17 @@ class TreeSearch:
         names = (list(self.model.actions), list(self.model.observations))
         return drawing_of(self._beliefs if self.method == "bounds" else self.tree, *names, depth, format)
 
-    def _kept(self, belief: np.ndarray, mask: np.ndarray) -> bool:
-        """Whether the tree at hand was grown for this belief, and its root has tried nothing that is forbidden."""
-        if self._planted is None or not np.allclose(self._planted, belief, atol=1e-9):
-            return False
-        return bool(mask.all())
+    def _goes_on(self, belief: np.ndarray, mask: np.ndarray) -> bool:
+        """Whether the tree at hand is what `update` kept for this belief; notes what the next tree is grown for."""
+        kept = self._carried and self._planted is not None and bool(mask.all())
+        kept = kept and bool(np.allclose(self._planted, belief, atol=1e-9))
+        self._planted, self._carried = (belief if mask.all() else None), False
+        return kept
 
     def _plan_with_bounds(self, belief: np.ndarray, mask: np.ndarray) -> tuple[int, dict[str, Any]]:
         arrays, flat = self._bounds.arrays, self._bounds.flat
-        if not self._kept(belief, mask):
+        if not self._goes_on(belief, mask):
             bound_search.plant(self._beliefs, arrays, *sparse_belief(belief), self._bounds.dense)
-        self._planted = belief if mask.all() else None
         tree = self._beliefs
         before = tree.visits[0]
         started, done = time.perf_counter(), 0
@@ -204,9 +205,8 @@ class TreeSearch:
         }
 
     def _plan_by_walks(self, belief: np.ndarray, mask: np.ndarray) -> tuple[int, dict[str, Any]]:
-        if not self._kept(belief, mask):
+        if not self._goes_on(belief, mask):
             clear(self.tree)
-        self._planted = belief if mask.all() else None
         support, value = sparse_belief(belief)
         start = TabularBelief(support, np.cumsum(value) / value.sum())
         info = walks(

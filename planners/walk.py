@@ -3,9 +3,10 @@
     s ~ b;  until a new node, an end or the depth limit:  a by UCB1,  (s', r, o) ~ model,  node <- child (a, o)
     value of the new node: the model's leaf value of s';  then back up
 
-A model says how to start a walk, how to take a step, what a step shows and what a state is worth. Two do: explicit
-POMDPs (`PackedPOMDP`) and the influence-augmented local model (`LocalModel`, branching on the person's pose where it
-is seen and on whether the robot moved, not on the 8^8 codes). Which one a compiled walk uses is settled by types.
+A model says how to start a walk, how to take a step, what a step shows and what a state is worth. Three do: explicit
+POMDPs (`PackedPOMDP`), a 2DBN with rewards on its factors (`FactoredModel`, of which some factors are seen) and the
+influence-augmented local model (`LocalModel`, branching on the person's pose where it is seen and on whether the
+robot moved, not on the 8^8 codes). Which one a compiled walk uses is settled by types.
 Sources: Silver and Veness 2010 (PO-UCT); Kocsis and Szepesvari 2006 (UCB1).
 """
 
@@ -19,6 +20,7 @@ import numpy as np
 
 from nesy.compiled import njit, overload
 from planners import ialm
+from planners.code_sampling import CodeSampler, next_code
 from planners.ialm import SCALARS
 from planners.kernels import Model, step
 from planners.random_bits import uniform
@@ -42,6 +44,20 @@ class TabularBelief(NamedTuple):
 
     support: np.ndarray
     cumulative: np.ndarray
+
+
+class FactoredModel(NamedTuple):
+    """A 2DBN as a decision problem; beliefs are particles int16 [P, N]. Leaves are worth nothing.
+
+    Attributes:
+        codes: the 2DBN, for drawing.
+        reward: float64 [N, K], what each value of each factor earns in the state reached.
+        seen: int64 [M], the factors that the robot observes.
+    """
+
+    codes: CodeSampler
+    reward: np.ndarray
+    seen: np.ndarray
 
 
 class LocalModel(NamedTuple):
@@ -101,6 +117,30 @@ def _tabular_advance(
     return model.reward[action, state[0]], model.terminal[reached], seen, model.leaf[reached]
 
 
+def _factored_room(model: FactoredModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    n = model.codes.order.shape[0]
+    return np.zeros(n, np.int16), np.zeros(n, np.int16), np.zeros(1, np.int16)
+
+
+def _factored_begin(model: FactoredModel, belief: np.ndarray, state: np.ndarray, bits: np.ndarray) -> bool:
+    particle = np.int64(uniform(bits) * belief.shape[0])
+    for i in range(state.shape[0]):
+        state[i] = belief[particle, i]
+    return True
+
+
+def _factored_advance(
+    model: FactoredModel, state: np.ndarray, action: int, after: np.ndarray, scratch: np.ndarray, bits: np.ndarray
+) -> tuple[float, bool, int, float]:
+    next_code(model.codes, state, 0, action, after, 0, bits)
+    reward, key = 0.0, 0
+    for i in range(after.shape[0]):
+        reward += model.reward[i, after[i]]
+    for j in range(model.seen.shape[0]):
+        key = key * model.reward.shape[1] + after[model.seen[j]]
+    return reward, False, key, 0.0
+
+
 def _local_room(model: LocalModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     n = model.model.dbn.order.shape[0]
     return (
@@ -138,6 +178,7 @@ def seen_key(scratch: np.ndarray, after: np.ndarray, n: int, visible: int) -> in
 
 _KINDS: dict[str, tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]] = {
     "PackedPOMDP": (_tabular_room, _tabular_begin, _tabular_advance),
+    "FactoredModel": (_factored_room, _factored_begin, _factored_advance),
     "LocalModel": (_local_room, _local_begin, _local_advance),
 }
 
@@ -183,6 +224,7 @@ def walk(
     discount: float,
     exploration: float,
     bellman: bool,
+    rollout: bool,
     allowed: np.ndarray,
     bits: np.ndarray,
     depths: np.ndarray,
@@ -190,7 +232,7 @@ def walk(
     """`count` simulations from the root of `tree`.
 
     Args:
-        model: a `PackedPOMDP` or a `LocalModel`.
+        model: a `PackedPOMDP`, a `FactoredModel` or a `LocalModel`.
         belief: a `TabularBelief`, or particles.
         tree: grows by at most one node per simulation.
         count: simulations.
@@ -198,6 +240,7 @@ def walk(
         discount: per step.
         exploration: weight of UCB1's bonus.
         bellman: whether a node is worth its best action; otherwise what was earned on average.
+        rollout: whether a new node is valued by random actions down to `depth`, not by the model's leaf value.
         allowed: bool [A], actions at the root.
         bits: the random stream.
         depths: int64 [2], adds the lengths of the walks, and keeps the greatest.
@@ -222,13 +265,25 @@ def walk(
             node = find_child(tree, node, action, seen, True)
             if node < 0:
                 break
+        steps = length
+        if rollout and node != NO_CHILD:
+            value, share = 0.0, 1.0
+            while steps < depth:
+                action = min(int(uniform(bits) * allowed.shape[0]), allowed.shape[0] - 1)
+                reward, ended, seen, leaf_value = advance(model, state, action, after, scratch, bits)
+                state, after = after, state
+                value += share * reward
+                share *= discount
+                steps += 1
+                if ended:
+                    break
         if bellman:
             made = -node - 1 if -tree.size[0] <= node < 0 else -1
             backup_best(tree, nodes, actions, rewards, length, made, value, discount)
         else:
             backup(tree, nodes, actions, rewards, length, value, discount)
-        depths[0] += length
-        depths[1] = max(depths[1], length)
+        depths[0] += steps
+        depths[1] = max(depths[1], steps)
 
 
 def walks(
@@ -243,6 +298,7 @@ def walks(
     bellman: bool,
     allowed: np.ndarray,
     bits: np.ndarray,
+    rollout: bool = False,
 ) -> dict[str, Any]:
     """Simulate up to `simulations` times, for at most `time_limit` seconds (0: no limit); what came of it.
 
@@ -257,7 +313,7 @@ def walks(
         if time_limit > 0 and done and time.perf_counter() - started >= time_limit:
             break
         count = min(chunk, simulations - done)
-        walk(model, belief, tree, count, depth, discount, exploration, bellman, allowed, bits, depths)
+        walk(model, belief, tree, count, depth, discount, exploration, bellman, rollout, allowed, bits, depths)
         done += count
     size = int(tree.size[0])
     return {
