@@ -314,10 +314,10 @@ class Training:
             group["lr"] = rate
         self.owed += config.updates_per_step * config.num_envs
         for _ in range(int(self.owed)):
-            self._update()
+            self.update()
         self.owed -= int(self.owed)
 
-    def _update(self) -> None:
+    def update(self) -> None:
         """One gradient step on one batch, and the target network after it."""
         config, network = self.config, self.network
         age, env, weight = self.replay.draw(config.batch_size, self.rng, config.prioritised)
