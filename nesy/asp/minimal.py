@@ -1,12 +1,11 @@
 """The shortest rules that say exactly where something holds, found by answer set programming (minimal.lp).
 
 For cases without noise and with few conditions: what a value of a readable factor means in predicates. One
-conjunction is looked for first, then two, then three; where that takes too long, nothing is returned.
+conjunction is looked for first, then two, then three; where that takes too much searching, nothing is returned (the
+limit is a number of conflicts, not of seconds: the same views give the same rules on every machine).
 """
 
 from __future__ import annotations
-
-import time
 
 import clingo
 import numpy as np
@@ -16,14 +15,13 @@ from nesy.dbn.rows import unique_rows
 
 MOST_LITERALS = 250
 MOST_PATTERNS = 400
+MOST_CONFLICTS = 3000
 
 Conjunction = tuple[tuple[int, bool], ...]
 """(column, whether it holds) pairs, ascending."""
 
 
-def minimal_form(
-    columns: np.ndarray, truth: np.ndarray, most_rules: int = 3, time_limit: float = 0.5
-) -> tuple[Conjunction, ...] | None:
+def minimal_form(columns: np.ndarray, truth: np.ndarray, most_rules: int = 3) -> tuple[Conjunction, ...] | None:
     """The fewest conditions, in at most `most_rules` conjunctions, that hold exactly where `truth` does.
 
     Of forms of one length the one with the earliest columns is taken.
@@ -32,19 +30,15 @@ def minimal_form(
         columns: bool [n, C].
         truth: bool [n], true somewhere and false somewhere.
         most_rules: most conjunctions.
-        time_limit: seconds for all of it.
 
     Returns:
-        The conjunctions; None where there is no such form, or none was proven shortest in time.
+        The conjunctions; None where there is no such form, or none was proven shortest within 3,000 conflicts.
     """
     positive, negative = _patterns(columns[truth]), _patterns(columns[~truth])
-    deadline = time.monotonic() + time_limit
     for rules in range(1, most_rules + 1):
-        found = _solve(positive, negative, rules, deadline)
+        found = _solve(positive, negative, rules)
         if found is not None:
             return found
-        if time.monotonic() >= deadline:
-            break
     return None
 
 
@@ -52,7 +46,7 @@ def _patterns(rows: np.ndarray) -> np.ndarray:
     return np.asarray(rows[unique_rows(rows.astype(np.uint8))[0]])
 
 
-def _solve(positive: np.ndarray, negative: np.ndarray, rules: int, deadline: float) -> tuple[Conjunction, ...] | None:
+def _solve(positive: np.ndarray, negative: np.ndarray, rules: int) -> tuple[Conjunction, ...] | None:
     # literal 2c: column c holds; 2c+1: it does not
     holds = np.stack([positive, ~positive], axis=2).reshape(len(positive), -1)
     others = np.stack([negative, ~negative], axis=2).reshape(len(negative), -1)
@@ -72,21 +66,18 @@ def _solve(positive: np.ndarray, negative: np.ndarray, rules: int, deadline: flo
     lines += [f"literal({x},{x // 2 + x % 2})." for x in literals]
     lines += [f"excludes({literals[x]},{n + 1})." for n, x in zip(*np.nonzero(excludes), strict=True)]
     lines += [f"misses({literals[x]},{p + 1})." for p, x in zip(*np.nonzero(misses), strict=True)]
-    control = clingo.Control(["--warn=none", "--opt-mode=opt", "--opt-strategy=usc", "--models=0"])
+    control = clingo.Control(
+        ["--warn=none", "--opt-mode=opt", "--opt-strategy=usc", "--models=0", f"--solve-limit={MOST_CONFLICTS}"]
+    )
     control.load(str(ENCODINGS / "minimal.lp"))
     control.add("base", [], "\n".join(lines))
     control.ground([("base", [])])
     best: list[tuple[int, int]] | None = None
-    with control.solve(yield_=True, async_=True) as handle:
-        while True:
-            handle.resume()
-            if not handle.wait(max(0.0, deadline - time.monotonic())):
-                handle.cancel()
-                return None
-            model = handle.model()
-            if model is None:
-                break
+    with control.solve(yield_=True) as handle:
+        for model in handle:
             best = [(a.arguments[0].number, a.arguments[1].number) for a in model.symbols(shown=True)]
+        if not handle.get().exhausted:
+            return None
     if best is None:
         return None
     conjunctions = {tuple(sorted((x // 2, x % 2 == 0) for r, x in best if r == rule)) for rule in range(1, rules + 1)}

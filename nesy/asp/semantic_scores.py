@@ -27,6 +27,8 @@ FOLDS = 4
 SUPPORT = 20
 """A predicate is averaged over if it holds in at least so many distinct views, and fails in as many: with fewer, a
 fold holds hardly any."""
+MOST_FACTORS = 3
+"""... and if at most so many factors settle it (`determined`)."""
 
 
 def scores(
@@ -46,14 +48,16 @@ def scores(
         seed: of the divisions into folds.
 
     Returns:
-        `predicates`: predicates from codes; `values`: values from predicates; each with `count`, macro averages
+        `predicates`: predicates from codes, those that the code determines by few factors; `all_predicates`: all
+        that vary enough; `values`: values from predicates; each with `count`, macro averages
         `precision` and `recall` over held-out views, `length` (mean conditions of the rules from all views), the
         same by maps (`maps_precision`, `maps_recall`) and `each`, one record per predicate or value.
     """
     divisions = {"": folds(len(codebook), seed)}
     if maps_of_views is not None:
         divisions["maps_"] = map_folds(maps_of_views, seed)
-    chosen = set(determined(codebook, SUPPORT))
+    chosen = set(determined(codebook, MOST_FACTORS, SUPPORT))
+    supported = set(determined(codebook, None, SUPPORT))
     predicates = {}
     for name in (n for n in codebook.predicate_names if n in set(determined(codebook))):
         record = _record(
@@ -64,7 +68,7 @@ def scores(
             factor_names,
             predicates=False,
         )
-        predicates[name] = {**record, "counts": name in chosen}
+        predicates[name] = {**record, "counts": name in chosen, "supported": name in supported}
     names = ordered(codebook.predicate_names)
     columns = np.stack([codebook.predicate(name) for name in names], axis=1).astype(np.int64)
     values = {}
@@ -79,7 +83,14 @@ def scores(
                 predicates=True,
             )
             values[f"{factor_name}={value}"] = {**record, "counts": True}
-    return {"predicates": _macro(predicates), "values": _macro(values), "folds": FOLDS, "views": len(codebook)}
+    everything = {name: {**record, "counts": record["supported"]} for name, record in predicates.items()}
+    return {
+        "predicates": _macro(predicates),
+        "all_predicates": {name: figure for name, figure in _macro(everything).items() if name != "each"},
+        "values": _macro(values),
+        "folds": FOLDS,
+        "views": len(codebook),
+    }
 
 
 def folds(views: int, seed: int) -> list[np.ndarray]:

@@ -9,6 +9,7 @@ rules do on views they were not learned from is measured in nesy.asp.semantic_sc
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Sequence
 
@@ -18,6 +19,7 @@ from nesy.asp.induction import induce
 from nesy.asp.minimal import minimal_form
 from nesy.asp.rules import Rule, RuleSet, counted, scored
 from nesy.dbn.codebook import Codebook
+from nesy.dbn.rows import unique_rows
 from nesy.errors import UserError
 
 _PLACE = re.compile(r"_\d+_\d+$")
@@ -114,17 +116,32 @@ def _without(views: int, test: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return train, test
 
 
-def determined(codebook: Codebook, least: int = 1) -> tuple[str, ...]:
+def determined(codebook: Codebook, most_factors: int | None = None, least: int = 1) -> tuple[str, ...]:
     """The predicates that the code determines.
 
-    That is: no two views of one code disagree on them; and they hold in at least `least` views and fail in as many.
+    That is: some factors, at most `most_factors` of them, settle the predicate: of the views met that agree on them no
+    two disagree on it. With all factors that says little where every view has a code of its own: then it only says
+    that the views can be told apart. With few factors, a value of theirs is shared by many views, and what it
+    settles can be learned from some of them for the others.
+
+    Args:
+        codebook: the views and their codes.
+        most_factors: how many factors may be needed; all by default.
+        least: the predicate holds in at least so many views, and fails in as many.
     """
-    _, index = codebook.distinct_codes()
-    sizes = np.bincount(index)
-    names = []
-    for p, name in enumerate(codebook.predicate_names):
-        truth = codebook.predicates[:, p]
-        hits = np.bincount(index, weights=truth)
-        if min(truth.sum(), (~truth).sum()) >= least and ((hits == 0) | (hits == sizes)).all():
-            names.append(name)
-    return tuple(names)
+    truth = codebook.predicates.astype(np.int64)
+    counts = truth.sum(axis=0)
+    open_ = np.minimum(counts, len(truth) - counts) >= max(least, 1)
+    chosen = np.zeros(truth.shape[1], dtype=bool)
+    factors = codebook.codes.shape[1]
+    sizes = [factors] if most_factors is None else range(1, min(most_factors, factors) + 1)
+    for size in sizes:
+        for subset in itertools.combinations(range(factors), size):
+            columns = np.flatnonzero(open_ & ~chosen)
+            if not len(columns):
+                break
+            _, index, total = unique_rows(codebook.codes[:, subset])
+            hits = np.zeros((len(total), len(columns)), dtype=np.int64)
+            np.add.at(hits, index, truth[:, columns])
+            chosen[columns[((hits == 0) | (hits == total[:, None])).all(axis=0)]] = True
+    return tuple(name for name, yes in zip(codebook.predicate_names, chosen, strict=True) if yes)
