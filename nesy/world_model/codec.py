@@ -90,14 +90,32 @@ class SymbolicCodec:
         return self._views_of.rows[index]
 
     def predict(self, beliefs: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """Next beliefs float32 [B, N, K] after actions [B], by the network's transition."""
+        """Next beliefs float32 [B, N, K] after actions [B], by the network's transition.
+
+        Where all beliefs are certain, each distinct pair of a code and an action is asked once.
+        """
+        beliefs, actions = np.asarray(beliefs, dtype=np.float32), np.asarray(actions, dtype=np.int64)
         assert beliefs.shape[1:] == (self.num_factors, self.num_values), beliefs.shape
         assert len(actions) == len(beliefs), (len(actions), len(beliefs))
+        if len(beliefs) < 2 or not (beliefs.max(-1) == 1).all():
+            return self._predict(beliefs, actions)
+        keys = code_keys(beliefs.argmax(-1), self.num_values) * self.num_actions + actions
+        _, first, place = np.unique(keys, return_index=True, return_inverse=True)
+        return self._predict(beliefs[first], actions[first])[place]
+
+    def _predict(self, beliefs: np.ndarray, actions: np.ndarray) -> np.ndarray:
         device = self.model.device()
         with torch.no_grad():
-            belief = torch.as_tensor(np.asarray(beliefs, dtype=np.float32), device=device)
-            action = torch.as_tensor(np.asarray(actions, dtype=np.int64), device=device)
-            return np.asarray(self.model.transition(belief, action).cpu().numpy(), dtype=np.float32)
+            parts = [
+                self.model.transition(
+                    torch.as_tensor(beliefs[first : first + CHUNK], device=device),
+                    torch.as_tensor(actions[first : first + CHUNK], device=device),
+                ).cpu()
+                for first in range(0, len(beliefs), CHUNK)
+            ]
+        if not parts:
+            return np.zeros_like(beliefs)
+        return np.concatenate([part.numpy() for part in parts]).astype(np.float32)
 
     def packed(self) -> PackedModel | None:
         """The forward model's tables for compiled loops; None where the forward model is no table."""

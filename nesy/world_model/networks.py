@@ -251,6 +251,11 @@ def _mix(table: Tensor, parents: list[Tensor], size: int) -> Tensor:
     """Average of a table over its first digits, under independent parents [B, K] for them: [B, rest of a row]."""
     if not parents:
         return table.reshape(1, -1).expand(size, -1)
+    if all(bool((parent.amax(1) == 1).all()) for parent in parents):  # certain parents: their rows, nothing to average
+        row = torch.zeros(size, dtype=torch.int64, device=table.device)
+        for parent in parents:
+            row = row * table.shape[1] + parent.argmax(1)
+        return table.view(table.shape[1] ** len(parents), -1)[row]
     # The most significant parent first: one matrix product, then the remaining digits by batched products.
     num_values = table.shape[1]
     mixed = parents[0] @ table.view(num_values, -1)
