@@ -58,7 +58,7 @@ class TabularPOMDP:
         for a, name in enumerate(self.actions):
             rows = np.asarray(self.transition[a].sum(axis=1)).reshape(-1)
             for what, sums in (("transitions", rows), ("observations", self.observation[a].sum(axis=1))):
-                if (wrong := np.flatnonzero(np.abs(sums - 1) > 1e-5)).size:
+                if (wrong := np.flatnonzero(~(np.abs(sums - 1) <= 1e-5))).size:
                     s = int(wrong[0])
                     raise UserError(
                         f"{what} of action '{name}' in state '{self.states[s]}' sum to {sums[s]:.6g}, not 1"
@@ -68,7 +68,12 @@ class TabularPOMDP:
                 stays = self.transition[a][ends][:, ends].sum(axis=1)
                 if (np.abs(np.asarray(stays) - 1) > 1e-9).any() or self.reward[a, ends].any():
                     raise UserError(f"action '{name}' leaves a terminal state or earns something there")
-        if abs(self.start.sum() - 1) > 1e-5:
+        tables = [*(m.data for m in self.transition), self.observation, self.start]
+        if any((table < 0).any() for table in tables):
+            raise UserError("a probability is negative")
+        if not np.isfinite(self.reward).all():
+            raise UserError("a reward is not a number")
+        if not abs(self.start.sum() - 1) <= 1e-5:
             raise UserError(f"start probabilities sum to {self.start.sum():.6g}, not 1")
 
     @classmethod

@@ -2,7 +2,9 @@
 
 Preamble `discount`, `values` (reward or cost), `states`, `actions`, `observations` (a number or names), `start`
 (probabilities, uniform, one state, include, exclude); then `T`, `O` and `R` entries for single numbers, rows or
-whole matrices, with `*` for all, `identity` and `uniform`. Later entries replace earlier ones.
+whole matrices, with `*` for all, `identity`, `uniform` and `reset` (to the start distribution). Later entries replace
+earlier ones. Rows that rounding in the file keeps from summing to 1 are scaled. Transitions and rewards are kept
+sparse, so files with ten thousand states can be read.
 Source: A. Cassandra, "POMDP file format", pomdp.org.
 """
 
@@ -19,7 +21,9 @@ from nesy.run_folder import atomic_path
 from planners.pomdp import TabularPOMDP
 
 _KEYWORDS = ("discount", "values", "states", "actions", "observations", "start", "T", "O", "R")
-_LARGEST = 60_000_000  # entries of one action's reward table
+_ROUNDING = 1e-3  # how far a row may be from summing to 1
+_LARGEST = 50_000_000  # entries of a table that a file may name at once
+RewardEntry = tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None, np.ndarray]
 
 
 def read(path: Path) -> TabularPOMDP:
@@ -29,12 +33,16 @@ def read(path: Path) -> TabularPOMDP:
         UserError: the file is missing, or a line is not understood; the message names the line.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8", errors="replace")
     except FileNotFoundError:
         raise UserError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
         raise UserError(f"{path}: cannot be read ({error})") from None
     return _Reader(text, str(path)).model()
+
+
+Row = dict[int, float] | np.ndarray
+"""One row of transitions: {next state: chance}, or all of it."""
 
 
 class _Reader:
@@ -49,6 +57,7 @@ class _Reader:
                 self.tokens.append(token)
                 self.lines.append(number)
         self.names: dict[str, list[str]] = {}
+        self.places: dict[str, dict[str, int]] = {}
         self.discount, self.sign = 1.0, 1.0
         self.start: np.ndarray | None = None
 
@@ -74,12 +83,17 @@ class _Reader:
     def number(self) -> float:
         token = self.take()
         try:
-            return float(token)
+            value = float(token)
         except ValueError:
+            value = np.nan
+        if not np.isfinite(value):
             self.at -= 1
-            raise self.fail(f"expected a number, found '{token}'") from None
+            raise self.fail(f"expected a number, found '{token}'")
+        return value
 
     def numbers(self, count: int) -> np.ndarray:
+        if count > _LARGEST:
+            raise self.fail(f"a table of {count} numbers is too large")
         return np.array([self.number() for _ in range(count)])
 
     def at_keyword(self) -> bool:
@@ -90,9 +104,9 @@ class _Reader:
         names, token = self.names[kind], self.take()
         if token == "*":
             return np.arange(len(names))
-        if token in names:
-            return np.array([names.index(token)])
-        if token.isdigit() and int(token) < len(names):
+        if token in self.places[kind]:
+            return np.array([self.places[kind][token]])
+        if token.isdecimal() and int(token) < len(names):
             return np.array([int(token)])
         self.at -= 1
         raise self.fail(f"unknown {kind[:-1]} '{token}'")
@@ -105,9 +119,13 @@ class _Reader:
                 raise self.fail(f"the preamble lacks '{kind}:'")
         num_states, num_actions = len(self.names["states"]), len(self.names["actions"])
         num_observations = len(self.names["observations"])
-        transition = np.zeros((num_actions, num_states, num_states))
+        if num_actions * num_states * num_observations > _LARGEST:
+            raise UserError(f"{self.name}: {num_states} states and {num_observations} observations are too many")
+        if self.start is None:
+            self.start = np.full(num_states, 1.0 / num_states)
+        transition: list[list[Row]] = [[{} for _ in range(num_states)] for _ in range(num_actions)]
         observation = np.zeros((num_actions, num_states, num_observations))
-        rewards: list[tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None, np.ndarray]] = []
+        rewards: list[RewardEntry] = []
         while self.at < len(self.tokens):
             keyword = self.take()
             if keyword not in ("T", "O", "R"):
@@ -116,22 +134,25 @@ class _Reader:
             self.colon()
             if keyword == "R":
                 rewards.append(self.reward_entry())
+            elif keyword == "T":
+                self.transition_entry(transition)
             else:
-                columns = "states" if keyword == "T" else "observations"
-                self.matrix_entry(transition if keyword == "T" else observation, columns, keyword)
-        reward = self.expected_reward(rewards, transition, observation)
-        start = np.full(num_states, 1.0 / num_states) if self.start is None else self.start
-        stays = (transition[:, np.arange(num_states), np.arange(num_states)] > 1 - 1e-12).all(axis=0)
+                self.observation_entry(observation)
+        matrices = [self.matrix(rows, action) for rows, action in zip(transition, self.names["actions"], strict=True)]
+        sums = observation.sum(axis=2, keepdims=True)
+        observation = np.where(np.abs(sums - 1) <= _ROUNDING, observation / np.where(sums > 0, sums, 1.0), observation)
+        reward = self.expected_reward(rewards, matrices, observation)
+        stays = np.all([m.diagonal() > 1 - 1e-12 for m in matrices], axis=0)
         try:
             return TabularPOMDP(
                 states=tuple(self.names["states"]),
                 actions=tuple(self.names["actions"]),
                 observations=tuple(self.names["observations"]),
-                transition=[sparse.csr_array(matrix) for matrix in transition],
+                transition=matrices,
                 observation=observation,
                 reward=reward,
                 discount=self.discount,
-                start=start,
+                start=self.start / self.start.sum() if abs(self.start.sum() - 1) <= _ROUNDING else self.start,
                 terminal=stays & (reward == 0).all(axis=0),
             )
         except UserError as error:
@@ -154,11 +175,14 @@ class _Reader:
             words = []
             while self.at < len(self.tokens) and not self.at_keyword():
                 words.append(self.take())
-            if len(words) == 1 and words[0].isdigit():
+            if len(words) == 1 and words[0].isdecimal():
+                if int(words[0]) > _LARGEST:
+                    raise self.fail(f"{words[0]} {keyword} are too many")
                 words = [str(i) for i in range(int(words[0]))]
             if len(set(words)) != len(words):
                 raise self.fail(f"a name occurs twice in '{keyword}:'")
             self.names[keyword] = words
+            self.places[keyword] = {word: i for i, word in enumerate(words)}
 
     def read_start(self) -> None:
         if "states" not in self.names:
@@ -191,32 +215,83 @@ class _Reader:
         count, self.at = self.at - begin, begin
         return count
 
-    def matrix_entry(self, table: np.ndarray, columns: str, keyword: str) -> None:
+    def transition_entry(self, table: list[list[Row]]) -> None:
+        actions, count = self.which("actions"), len(self.names["states"])
+        if self.peek() != ":":
+            rows = self.block((count, count))
+            for a in actions:
+                table[a] = [{s: 1.0} for s in range(count)] if rows is None else list(rows)
+            return
+        self.colon()
+        states = self.which("states")
+        if self.peek() != ":":
+            row = self.block((count,))
+            for a in actions:
+                for s in states:
+                    table[a][s] = row
+            return
+        self.colon()
+        after, chance = self.which("states"), self.number()
+        for a in actions:
+            for s in states:
+                if len(after) == count:
+                    table[a][s] = np.full(count, chance) if chance else {}
+                    continue
+                row = table[a][s]
+                if not isinstance(row, dict):
+                    row = dict(enumerate(row.tolist()))
+                table[a][s] = row | {int(after[0]): chance}
+
+    def observation_entry(self, table: np.ndarray) -> None:
         actions = self.which("actions")
         if self.peek() != ":":
-            table[actions] = self.block(table.shape[1:], keyword == "T")
+            table[actions] = self.block(table.shape[1:], uniform_only=True)
             return
         self.colon()
-        rows = self.which("states")
+        states = self.which("states")
         if self.peek() != ":":
-            table[np.ix_(actions, rows)] = self.block(table.shape[2:], False)
+            table[np.ix_(actions, states)] = self.block(table.shape[2:], uniform_only=True)
             return
         self.colon()
-        chosen = self.which(columns)
-        table[np.ix_(actions, rows, chosen)] = self.number()
+        seen = self.which("observations")
+        table[np.ix_(actions, states, seen)] = self.number()
 
-    def block(self, shape: tuple[int, ...], square: bool) -> np.ndarray:
-        if self.peek() == "uniform":
+    def block(self, shape: tuple[int, ...], uniform_only: bool = False) -> np.ndarray | None:
+        """A row or a matrix of numbers, or the word for one; None stands for the identity."""
+        word = self.peek()
+        if word == "uniform":
             self.take()
-            return np.full(shape, 1.0 / shape[-1])
-        if self.peek() == "identity" and square:
+            return np.broadcast_to(np.full(shape[-1], 1.0 / shape[-1]), shape)
+        if word == "reset" and not uniform_only:
             self.take()
-            return np.eye(shape[0])
+            assert self.start is not None
+            return np.broadcast_to(self.start, shape)
+        if word == "identity" and not uniform_only and len(shape) == 2:
+            self.take()
+            return None
         return self.numbers(int(np.prod(shape))).reshape(shape)
 
-    def reward_entry(
-        self,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None, np.ndarray]:
+    def matrix(self, rows: list[Row], action: str) -> sparse.csr_array:
+        """The rows of one action as a sparse matrix; each sums to 1 up to rounding."""
+        count = len(rows)
+        indices, values, ends = [], [], [0]
+        for s, row in enumerate(rows):
+            index, value = (
+                (np.array(sorted(row), np.int64), np.array([row[t] for t in sorted(row)], np.float64))
+                if isinstance(row, dict)
+                else (np.flatnonzero(row), row[np.flatnonzero(row)])
+            )
+            total = value.sum()
+            if abs(total - 1) > _ROUNDING or (value < 0).any():
+                state = self.names["states"][s]
+                wrong = "hold a negative number" if (value < 0).any() else f"sum to {total:.6g}, not 1"
+                raise UserError(f"{self.name}: transitions of action '{action}' in state '{state}' {wrong}")
+            indices.append(index[value > 0])
+            values.append(value[value > 0] / total)
+            ends.append(ends[-1] + len(indices[-1]))
+        return sparse.csr_array((np.concatenate(values), np.concatenate(indices), np.array(ends)), (count, count))
+
+    def reward_entry(self) -> RewardEntry:
         num_states, num_observations = len(self.names["states"]), len(self.names["observations"])
         actions = self.which("actions")
         self.colon()
@@ -232,28 +307,39 @@ class _Reader:
         return actions, states, after, seen, self.numbers(1)
 
     def expected_reward(
-        self,
-        entries: list[tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None, np.ndarray]],
-        transition: np.ndarray,
-        observation: np.ndarray,
+        self, entries: list[RewardEntry], transition: list[sparse.csr_array], observation: np.ndarray
     ) -> np.ndarray:
-        """R[a, s] = sum_s' T sum_o Z R(a, s, s', o), action by action."""
+        """R[a, s] = sum_s' T sum_o Z R(a, s, s', o), row by row, over the successors that a row has."""
         num_actions, num_states, num_observations = observation.shape
-        if num_states * num_states * num_observations > _LARGEST:
-            raise UserError(f"{self.name}: {num_states} states and {num_observations} observations are too many")
         out = np.zeros((num_actions, num_states))
-        for a in range(num_actions):
-            table = np.zeros((num_states, num_states, num_observations))
-            for actions, states, after, seen, values in entries:
-                if a not in actions:
-                    continue
-                if after is None:
-                    table[states] = values.reshape(num_states, num_observations)
-                elif seen is None:
-                    table[np.ix_(states, after)] = values
+        wide: list[list[int]] = [[] for _ in range(num_actions)]  # entries of all states, by action
+        single: dict[tuple[int, int], list[int]] = {}
+        for number, (actions, states, *_) in enumerate(entries):
+            for a in actions:
+                if len(states) > 1 or num_states == 1:
+                    wide[a].append(number)
                 else:
-                    table[np.ix_(states, after, seen)] = values[0]
-            out[a] = self.sign * np.einsum("st,to,sto->s", transition[a], observation[a], table, optimize=True)
+                    single.setdefault((int(a), int(states[0])), []).append(number)
+        for a in range(num_actions):
+            for s in range(num_states):
+                found = sorted(wide[a] + single.get((a, s), []))
+                if found:
+                    begin, end = transition[a].indptr[s : s + 2]
+                    reached, chance = transition[a].indices[begin:end], transition[a].data[begin:end]
+                    table = np.zeros((len(reached), num_observations))
+                    for number in found:
+                        _, _, after, seen, values = entries[number]
+                        if after is None:
+                            table[:] = values.reshape(num_states, num_observations)[reached]
+                            continue
+                        rows = slice(None) if len(after) == num_states else reached == after[0]
+                        if seen is None:
+                            table[rows] = values
+                        elif len(seen) == num_observations:
+                            table[rows] = values[0]
+                        else:
+                            table[rows, seen[0]] = values[0]
+                    out[a, s] = self.sign * float(chance @ (observation[a][reached] * table).sum(axis=1))
         return out
 
 

@@ -142,6 +142,46 @@ def test_rows_numbers_costs_and_start_forms(tmp_path: Path) -> None:
         assert model.transition[0].toarray()[1].tolist() == [0, 0, 1]
 
 
+def test_words_and_wildcards_for_rows(tmp_path: Path) -> None:
+    path = tmp_path / "m.pomdp"
+    path.write_text(
+        "discount: 0.9\nstates: a b c\nactions: go back\nobservations: x y\nstart: b\n"
+        "T: go identity\nT:go:a\nreset\nT: go : b uniform\nT: back : * : * 0\nT: back : * : a 1.0\n"
+        "O: * : * : x 0.333333\nO: * : * : y 0.666667\nO: go : c uniform\n"
+        "R: * : * : * : * 1\nR: go : b : c : y 7\nR: back : a : * : * -2\nR: back : c : a\n3 6\n"
+    )
+    model = TabularPOMDP.from_file(path)
+    assert np.allclose(model.transition[0].toarray(), [[0, 1, 0], [1 / 3, 1 / 3, 1 / 3], [0, 0, 1]])
+    assert np.allclose(model.transition[1].toarray(), [[1, 0, 0]] * 3)
+    assert np.allclose(model.observation.sum(axis=2), 1.0)
+    assert model.observation[0, 2].tolist() == [0.5, 0.5]
+    assert np.allclose(model.reward, [[1, 1 + 6 / 3 * 0.5, 1], [-2, 1, 3 / 3 + 6 * 2 / 3]], atol=1e-5)
+
+
+def test_large_files_are_read_sparsely(tmp_path: Path) -> None:
+    model = TabularPOMDP(**rocksample(5, 5))
+    model.to_file(tmp_path / "rocks.pomdp")
+    _same(TabularPOMDP.from_file(tmp_path / "rocks.pomdp"), model)
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(st.integers(0, 2**31))
+def test_damaged_files_end_in_one_line(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    words = TIGER_FILE.split(" ")
+    for _ in range(int(rng.integers(1, 4))):
+        at = int(rng.integers(len(words)))
+        words[at] = str(
+            rng.choice(["", ":", "*", "-1", "nan", "1e400", "99", "T:", "reset\n", "identity", words[at - 1]])
+        )
+    path = tmp_path_factory.getbasetemp() / "damaged.pomdp"
+    path.write_text(" ".join(words))
+    try:
+        TabularPOMDP.from_file(path)
+    except UserError as error:
+        assert "\n" not in str(error)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
