@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
+import subprocess
+import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,38 +14,69 @@ import numpy as np
 
 from domains.core import FORWARD, GOAL, Domain
 from nesy.dbn.codebook import Codebook
-from nesy.dbn.inference import most_probable_next
+from nesy.dbn.inference import likely_next
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
 from nesy.formats import pddl
 
+OPTIONS = (
+    *("--translate-options", "--invariant-generation-max-time", "0"),
+    *("--search-options", "--search", "astar(blind())"),
+)
+"""The reachable part has as many states as it has codes: it needs no invariants and no heuristic."""
 
-def by_fast_downward(dbn: TwoSliceDBN, start: np.ndarray, goals: np.ndarray) -> list[int] | None:
-    """A plan along most probable outcomes from a code to one of some codes; None if there is none.
+
+def by_fast_downward(
+    dbn: TwoSliceDBN, start: np.ndarray, goals: np.ndarray, outcomes: int = 1
+) -> list[tuple[int, tuple[int, ...]]] | None:
+    """A plan from a code to one of some codes; None if there is none.
+
+    Args:
+        dbn: the model.
+        start: integers [N].
+        goals: integers [G, N].
+        outcomes: of a step that the planner may choose among (see nesy.formats.pddl); 1: the most probable one.
+
+    Returns:
+        The actions, each with the code that is to follow.
 
     Raises:
         UserError: Fast Downward is not installed.
     """
-    try:
-        unified, reader = (importlib.import_module(f"unified_planning.{name}") for name in ("shortcuts", "io"))
-        importlib.import_module("up_fast_downward")
-    except ImportError:
-        raise UserError("Fast Downward is not installed; it comes with: pip install 'nesy[check]'") from None
-    unified.get_environment().credits_stream = None
-    inside = {tuple(code) for code in pddl.reachable_codes(dbn, start, pddl.known_codes(dbn)).tolist()}
+    driver = _driver()
+    inside = {tuple(code) for code in pddl.reachable_codes(dbn, start, pddl.known_codes(dbn), outcomes).tolist()}
     wanted = np.array([goal for goal in goals.tolist() if tuple(goal) in inside])
     if not len(wanted):
         return None
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "m.pddl"
-        pddl.write(dbn, path, start=start, goals=wanted, reachable=True)
-        problem = reader.PDDLReader().parse_problem(str(path), str(path.with_name("m_problem.pddl")))
-    with unified.OneshotPlanner(name="fast-downward") as planner:
-        result = planner.solve(problem)
-    if result.plan is None:
-        return None
-    names = [pddl.action_name(dbn, a) for a in range(dbn.num_actions)]
-    return [names.index(step.action.name) for step in result.plan.actions if step.action.name in names]
+        pddl.write(dbn, path, start=start, goals=wanted, reachable=True, outcomes=outcomes)
+        subprocess.run(
+            [sys.executable, str(driver), "--plan-file", "plan.txt", "m.pddl", "m_problem.pddl", *OPTIONS],
+            cwd=folder,
+            check=True,
+            capture_output=True,
+        )
+        steps = (Path(folder) / "plan.txt").read_text().splitlines()
+        codes = pddl.reachable_codes(dbn, start, pddl.known_codes(dbn), outcomes)
+    plan = []
+    for step in steps:
+        action = pddl.action_of(dbn, step) if step.startswith("(") else None
+        if action is not None:
+            number, rank = (int(part) for part in (step.strip("()").split("-")[1:] + ["0"])[:2])
+            plan.append((action, tuple(likely_next(dbn, codes[number][None], action)[0][0, rank].tolist())))
+    return plan
+
+
+def _driver() -> Path:
+    spec = importlib.util.find_spec("up_fast_downward")
+    if spec is None or not spec.submodule_search_locations:
+        raise UserError("Fast Downward is not installed; it comes with: pip install 'nesy[check]'")
+    return Path(spec.submodule_search_locations[0]) / "downward" / "fast-downward.py"
+
+
+Plan = list[tuple[int, tuple[int, ...]]]
+"""Actions, each with the code that is to follow."""
 
 
 @dataclass
@@ -64,7 +97,7 @@ class Executed:
     """Of them those without a plan."""
     wandering: int = 0
     """Random steps, taken where there was no plan."""
-    plans: dict[tuple[int, ...], list[int] | None] = field(default_factory=dict)
+    plans: dict[tuple[int, ...], Plan | None] = field(default_factory=dict)
     """Plans made so far, by the code they start from."""
 
 
@@ -77,11 +110,12 @@ def execute(
     episodes: int,
     seed: int,
     longest: int = 60,
+    outcomes: int = 4,
 ) -> Executed:
     """Drive to the goal of the crossing task by plans of Fast Downward, planning again on every surprise.
 
     The goals are the codes of all views with the goal straight ahead; a plan that has arrived ends with `forward`.
-    Where the planner finds none (most probable outcomes never show the goal), a random step is taken.
+    Where the planner finds no plan, a random step is taken.
 
     Args:
         domain: where.
@@ -92,6 +126,8 @@ def execute(
         episodes: how many, one after the other.
         seed: of maps and random steps.
         longest: steps after which an episode is given up.
+        outcomes: of a step that the planner may choose among; with 1, the most probable ones, it mostly finds no
+            plan from the start, since these never show the goal.
     """
     side = codebook.views.shape[1]
     ahead = (side // 2, side - 2)
@@ -103,7 +139,7 @@ def execute(
     result = Executed()
     for _ in range(episodes):
         result.episodes += 1
-        waiting: list[int] = []
+        waiting: Plan = []
         expected: tuple[int, ...] | None = None
         for _ in range(longest):
             code = encode(observation["view"])[0].astype(np.int64)
@@ -114,11 +150,9 @@ def execute(
             if place in there:
                 action, expected = FORWARD, None
             else:
-                waiting = waiting or _plan(result, dbn, code, goals)
-                wanders = not waiting
-                result.wandering += wanders
-                action = int(rng.integers(3)) if wanders else waiting.pop(0)
-                expected = None if wanders else tuple(most_probable_next(dbn, code[None], action, 1)[0][0].tolist())
+                waiting = waiting or _plan(result, dbn, code, goals, outcomes)
+                result.wandering += not waiting
+                action, expected = waiting.pop(0) if waiting else (int(rng.integers(3)), None)
             observation, reward, terminated, truncated, _ = environment.step(np.array([action]))
             result.steps += 1
             if terminated[0] or truncated[0]:
@@ -129,12 +163,14 @@ def execute(
     return result
 
 
-def _plan(result: Executed, dbn: TwoSliceDBN, code: np.ndarray, goals: np.ndarray) -> list[int]:
+def _plan(result: Executed, dbn: TwoSliceDBN, code: np.ndarray, goals: np.ndarray, outcomes: int) -> Plan:
     """The plan from a code, made once; empty where there is none."""
     place = tuple(code.tolist())
     if place not in result.plans:
-        plan = by_fast_downward(dbn, code, goals)
+        plan = by_fast_downward(dbn, code, goals, outcomes)
         result.plans[place] = plan
+        # what remains of a plan is the plan from the codes on its way
+        result.plans |= {there: plan[step + 1 :] for step, (_, there) in enumerate(plan or ())}
         result.calls += 1
         result.unsolved += plan is None
     return list(result.plans[place] or ())

@@ -1,23 +1,29 @@
-"""PDDL of the most probable outcomes, for classical planners.
+"""PDDL of the most probable outcomes, for classical planners: plain STRIPS.
 
-One action per action, with one conditional effect per factor and context. Arcs within slice t+1 are folded away:
-a context is the values of all factors of slice t that the outcome depends on, and only contexts of codes met in
-experience are written; on request, only those that most probable outcomes lead to from the start. Where no context
-fits, a factor keeps its value.
+One action per action and code met in experience (`forward-17`): its preconditions are the values of that code, its
+effects the values that change in the most probable next code. A step is left out whose most probable outcome is a code
+that experience never met; on request, so are all codes that the outcomes do not lead to from the start.
+
+Most probable outcomes alone may never lead anywhere (a corridor that mostly goes on never shows its end). With
+`outcomes` above 1 every step has that many variants (`forward-17-1`), each with the cost 1 + 100 * -ln(probability):
+the planner then chooses what happens, and pays for its optimism; who executes the plan plans again when surprised.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
-from nesy.dbn.inference import most_probable_next
+from nesy.dbn.inference import likely_next
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
 from nesy.formats.bayes_nodes import identifier
 from nesy.run_folder import atomic_path
+
+LEAST = 0.05
+"""Least probability of an outcome that is not the most probable one."""
 
 
 def write(
@@ -27,6 +33,7 @@ def write(
     goals: np.ndarray | None = None,
     reachable: bool = False,
     goal: Mapping[int, int] | None = None,
+    outcomes: int = 1,
 ) -> None:
     """Write the domain to `path` and the problem to `NAME_problem.pddl` beside it.
 
@@ -35,8 +42,10 @@ def write(
         path: the domain's file.
         start: integers [N]: the initial code; by default each factor's most probable initial value.
         goals: integers [G, N]: codes of which one is to be reached; without it the problem has no goal.
-        reachable: write only the contexts that can be met from the start if every outcome is the most probable one.
+        reachable: write only the codes that can be met from the start if every outcome is the most probable one.
         goal: {factor: value}: the goal as values of some factors, in place of `goals`.
+        outcomes: how many outcomes of a step are written, the most probable first; further ones only from a
+            probability of `LEAST` on.
 
     Raises:
         UserError: the model does not say which codes were met and has too many to write all.
@@ -44,26 +53,11 @@ def write(
     codes = known_codes(dbn)
     code = dbn.initial.argmax(axis=1) if start is None else np.asarray(start)
     if reachable:
-        codes = reachable_codes(dbn, code, codes)
+        codes = reachable_codes(dbn, code, codes, outcomes)
     with atomic_path(path) as temporary:
-        temporary.write_text(_domain(dbn, codes, goals), encoding="utf-8")
+        temporary.write_text(_domain(dbn, codes, goals, outcomes), encoding="utf-8")
     with atomic_path(path.with_name(f"{path.stem}_problem{path.suffix}")) as temporary:
-        temporary.write_text(_problem(code, goals, goal), encoding="utf-8")
-
-
-def reachable_codes(dbn: TwoSliceDBN, start: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """The known codes that most probable outcomes lead to from a start, integers [M, N]; the start among them."""
-    allowed = {tuple(code) for code in known.tolist()}
-    found = {tuple(int(v) for v in start)}
-    front = list(found)
-    while front:
-        now = np.array(front)
-        later = {
-            tuple(code) for a in range(dbn.num_actions) for code in most_probable_next(dbn, now, a, beam=1)[0].tolist()
-        }
-        front = sorted((later & allowed) - found)
-        found |= set(front)
-    return np.array(sorted(found))
+        temporary.write_text(_problem(code, goals, goal, outcomes), encoding="utf-8")
 
 
 def known_codes(dbn: TwoSliceDBN) -> np.ndarray:
@@ -79,57 +73,75 @@ def known_codes(dbn: TwoSliceDBN) -> np.ndarray:
     return np.array(list(np.ndindex(*(dbn.num_values,) * dbn.num_factors)))
 
 
-def action_name(dbn: TwoSliceDBN, action: int) -> str:
-    """The name of an action in the file."""
-    return identifier(dbn.action_names[action]).lower()
+def reachable_codes(dbn: TwoSliceDBN, start: np.ndarray, known: np.ndarray, outcomes: int = 1) -> np.ndarray:
+    """The known codes that the outcomes lead to from a start, integers [M, N]; the start among them."""
+    allowed = {tuple(code) for code in known.tolist()}
+    found = {tuple(int(v) for v in start)}
+    front = list(found)
+    while front:
+        now = np.array(front)
+        later = {code for a in range(dbn.num_actions) for _, code, _ in _outcomes(dbn, now, a, outcomes)}
+        front = sorted((later & allowed) - found)
+        found |= set(front)
+    return np.array(sorted(found))
+
+
+def _outcomes(
+    dbn: TwoSliceDBN, codes: np.ndarray, action: int, most: int
+) -> Iterator[tuple[int, tuple[int, ...], float]]:
+    """(number of the code, next code, probability) of the outcomes written."""
+    later, chances = likely_next(dbn, codes, action)
+    for number in range(len(codes)):
+        for rank in range(min(most, later.shape[1])):
+            if rank == 0 or chances[number, rank] >= LEAST:
+                yield number, tuple(later[number, rank].tolist()), float(chances[number, rank])
+
+
+def action_of(dbn: TwoSliceDBN, name: str) -> int | None:
+    """The action that a step of a plan means; None for the step that ends it."""
+    names = [identifier(action).lower() for action in dbn.action_names]
+    head = name.strip("()").lower().split("-")[0]
+    return names.index(head) if head in names else None
 
 
 def _atom(factor: int, value: int) -> str:
     return f"(x{factor}-{value})"
 
 
-def _domain(dbn: TwoSliceDBN, codes: np.ndarray, goals: np.ndarray | None) -> str:
-    lines = ["(define (domain dbn)", "  (:requirements :strips :conditional-effects :negative-preconditions)"]
+def _domain(dbn: TwoSliceDBN, codes: np.ndarray, goals: np.ndarray | None, most: int) -> str:
+    costs = most > 1
+    lines = ["(define (domain dbn)", f"  (:requirements :strips{' :action-costs' if costs else ''})"]
     lines.append("  (:predicates (reached)")
     for i in range(dbn.num_factors):
         lines.append("    " + " ".join(_atom(i, k) for k in range(dbn.num_values)))
     lines.append("  )")
-    for a in range(dbn.num_actions):
-        lines += [f"  (:action {action_name(dbn, a)}", "    :parameters ()"]
-        lines += ["    :precondition ()", "    :effect (and"]
-        # factor by factor, so that a factor's outcome depends on its own context alone
-        later, _ = most_probable_next(dbn, codes, a, beam=1)
-        for i in range(dbn.num_factors):
-            scope = _scope(dbn, a, i)
-            contexts, first = np.unique(codes[:, scope], axis=0, return_index=True)
-            for context, row in zip(contexts.tolist(), first.tolist(), strict=True):
-                value = int(later[row, i])
-                old = dict(zip(scope, context, strict=True)).get(i)
-                if old == value:
-                    continue
-                when = " ".join(_atom(p, v) for p, v in zip(scope, context, strict=True))
-                losers = [old] if old is not None else [k for k in range(dbn.num_values) if k != value]
-                effects = " ".join(f"(not {_atom(i, k)})" for k in losers)
-                lines.append(f"      (when (and {when}) (and {effects} {_atom(i, value)}))")
-        lines.append("    ))")
+    lines += ["  (:functions (total-cost) - number)"] if costs else []
+    known = {tuple(code) for code in codes.tolist()}
+    plain = codes.tolist()
+    for a, action in enumerate(dbn.action_names):
+        before, rank = -1, 0
+        for number, later, chance in _outcomes(dbn, codes, a, most):
+            rank, before = (rank + 1 if number == before else 0), number
+            now = plain[number]
+            changes = [i for i in range(dbn.num_factors) if now[i] != later[i]]
+            if not changes or later not in known:
+                continue
+            name = f"{identifier(action).lower()}-{number}" + (f"-{rank}" if rank else "")
+            lines.append(f"  (:action {name} :parameters ()")
+            lines.append(f"    :precondition (and {' '.join(_atom(i, v) for i, v in enumerate(now))})")
+            effects = " ".join(f"(not {_atom(i, now[i])}) {_atom(i, later[i])}" for i in changes)
+            effects += f" (increase (total-cost) {1 + round(-100 * float(np.log(chance)))})" if costs else ""
+            lines.append(f"    :effect (and {effects}))")
     for number, goal in enumerate([] if goals is None else np.asarray(goals).tolist()):
         there = " ".join(_atom(i, v) for i, v in enumerate(goal))
-        lines += [f"  (:action arrive-{number}", "    :parameters ()", f"    :precondition (and {there})"]
-        lines.append("    :effect (reached))")
+        lines.append(f"  (:action arrive-{number} :parameters () :precondition (and {there}) :effect (reached))")
     return "\n".join([*lines, ")"]) + "\n"
 
 
-def _scope(dbn: TwoSliceDBN, action: int, factor: int) -> list[int]:
-    """The factors of slice t that the most probable value of a factor depends on."""
-    scope = set(dbn.parents_now[action][factor])
-    for p in dbn.parents_next[action][factor]:
-        scope |= set(_scope(dbn, action, p))
-    return sorted(scope)
-
-
-def _problem(code: np.ndarray, goals: np.ndarray | None, goal: Mapping[int, int] | None) -> str:
+def _problem(code: np.ndarray, goals: np.ndarray | None, goal: Mapping[int, int] | None, most: int) -> str:
     start = " ".join(_atom(i, int(v)) for i, v in enumerate(code))
     wanted = "(reached)" if goals is not None and len(goals) else "(and)"
     if goal:
         wanted = "(and " + " ".join(_atom(i, v) for i, v in goal.items()) + ")"
-    return f"(define (problem start) (:domain dbn)\n  (:init {start})\n  (:goal {wanted}))\n"
+    costs = ("(= (total-cost) 0) ", "\n  (:metric minimize (total-cost))") if most > 1 else ("", "")
+    return f"(define (problem start) (:domain dbn)\n  (:init {costs[0]}{start})\n  (:goal {wanted}){costs[1]})\n"
