@@ -47,6 +47,13 @@ class TrainConfig:
     """Most parents from slice t that a factor may have under one action."""
     intra_slice_arcs: bool = True
     """Whether earlier factors of slice t+1 may be parents too."""
+    named_factors: int = 6
+    """Factors (of 8) whose values answer questions about the view; the rest complete the code. More of them make
+    codes easier to read and the next code harder to predict."""
+    headline: tuple[str, ...] = ("wall_ahead", "goal_visible", "opening_visible")
+    """Predicates that the first named factor answers in any case, where the domain has them."""
+    mirror_images: bool = True
+    """Whether every step also counts for its mirror image, left and right exchanged."""
     held_out: float = 0.2
     """Share of the maps kept out of training for the gates."""
     time_limit: float = 180.0
@@ -59,5 +66,11 @@ class TrainConfig:
 class ExtractConfig:
     """How the 2DBN is extracted."""
 
-    prior_count: float = 0.0
-    """Dirichlet count added to every row entry when rows are counted from experience."""
+    source: Literal["network", "experience"] = "network"
+    """What the tables are of: the trained network, or counts of the transitions met (in the network's codes)."""
+    score: Literal["bdeu", "bic", "aic"] = "bdeu"
+    """What parents are chosen by where the network does not say them: the `paper` architecture, or experience."""
+    max_parents: int = 4
+    """Most parents from slice t where they are chosen by score."""
+    prior_count: float = 1.0
+    """Transitions that the Dirichlet prior of a row counts as when rows are counted from experience."""

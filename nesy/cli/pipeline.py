@@ -242,13 +242,25 @@ class Pipeline:
         if not self.run.has("extract"):
             from nesy.dbn import extract_run, fidelity_report
 
-            figures = self._timed("extract", lambda: extract_run(self.run, self.config.domain))
+            figures = self._timed("extract", lambda: extract_run(self.run, self.config.domain, self.config.extract))
             figures["fidelity"] = self._timed(
                 "fidelity",
                 lambda: fidelity_report(self.run, self.config.domain, self.config.variant, self.config.seed),
             )
             self.run.update_summary(dbn=figures)
+            self._evaluate_shift()
         return dict(self.run.read_summary()["dbn"])
+
+    def _evaluate_shift(self) -> None:
+        """Measure the perspective shift, which takes the world model and, for some architectures, the 2DBN."""
+        from nesy.perspective_gates import evaluate_run
+
+        config = self.config
+        figures = self._timed(
+            "perspective",
+            lambda: evaluate_run(self.run, config.domain, config.variant, config.seed, config.train.held_out),
+        )
+        self.run.update_summary(perspective=figures)
 
     def compare(self, engine: str = "local", address: str | None = None) -> dict[str, Any]:
         """Compare the agents, with an engine of `planners.engines`."""

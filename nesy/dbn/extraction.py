@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from nesy.config import ExtractConfig
 from nesy.dbn.codebook import Codebook, distinct_views, value_meanings
 from nesy.dbn.model import Parents, TwoSliceDBN
 from nesy.dbn.rows import unique_rows
@@ -153,8 +154,13 @@ def marginals(codes: np.ndarray, num_values: int) -> np.ndarray:
     return np.stack([np.bincount(column, minlength=num_values) / len(codes) for column in codes.T])
 
 
-def extract_run(run: RunFolder, domain_name: str) -> dict[str, Any]:
+def extract_run(run: RunFolder, domain_name: str, config: ExtractConfig | None = None) -> dict[str, Any]:
     """Extract the 2DBN of a run: writes dbn/ (model and codebook) and returns its figures for summary.json.
+
+    Args:
+        run: the run.
+        domain_name: where its experience is from.
+        config: what the tables are of, and how parents are chosen.
 
     Raises:
         UserError: the run lacks its experience or its world model, or they are damaged.
@@ -165,6 +171,7 @@ def extract_run(run: RunFolder, domain_name: str) -> dict[str, Any]:
     from nesy.experience import SOURCES, load_columns
     from nesy.world_model import SymbolicCodec, load_world_model
 
+    config = config or ExtractConfig()
     domain = load_domain(domain_name)
     experience = load_columns(run.experience, COLUMNS)
     if not len(experience["action"]):
@@ -179,7 +186,7 @@ def extract_run(run: RunFolder, domain_name: str) -> dict[str, Any]:
         "initial_codes": transitions.codes[started] if started.any() else None,
         "meanings": value_meanings(codebook, int(model.num_values)),
         "provenance": {
-            "source": "network",
+            "source": config.source,
             "domain": domain_name,
             "architecture": str(model.architecture),
             "seed": _seed(run),
@@ -189,14 +196,11 @@ def extract_run(run: RunFolder, domain_name: str) -> dict[str, Any]:
     }
     *distinct, kind = transitions.numbered()
     weights = np.bincount(kind)
-    if isinstance(model, Conditionals):
+    network = model if isinstance(model, Conditionals) else network_marginals(codec)
+    if config.source == "network" and isinstance(model, Conditionals):
         dbn = extract(model, *distinct, weights=weights, **described)
     else:
-        from nesy.dbn.fitting import from_callable
-
-        dbn = from_callable(
-            network_marginals(codec), *distinct, weights=weights, num_values=int(model.num_values), **described
-        )
+        dbn = _fitted(network, distinct, weights, int(model.num_values), config, described)
     dbn = with_observation(dbn, codebook)
     # reward and end of the own task alone: those of a task with somebody else depend on more than the own code
     sources = [number for number, name in enumerate(SOURCES) if name.startswith(OWN_TASK)]
@@ -206,8 +210,33 @@ def extract_run(run: RunFolder, domain_name: str) -> dict[str, Any]:
     codebook.save(run.dbn)
     # last: the step counts as done when model.json is there
     dbn.save(run.dbn)
-    return fidelity(
-        TwoSliceDBN.load(run.dbn), model if isinstance(model, Conditionals) else network_marginals(codec), transitions
+    return fidelity(TwoSliceDBN.load(run.dbn), network if config.source == "network" else None, transitions)
+
+
+def _fitted(
+    network: Conditionals | Marginals,
+    distinct: Sequence[np.ndarray],
+    weights: np.ndarray,
+    num_values: int,
+    config: ExtractConfig,
+    described: dict[str, Any],
+) -> TwoSliceDBN:
+    """Parents chosen by score; rows counted from experience, or the network's predictions marginalised over it."""
+    from nesy.dbn.fitting import from_callable, from_experience
+    from nesy.dbn.structure import Search
+
+    if config.source == "network":
+        assert not isinstance(network, Conditionals)
+        search = Search(score=config.score, max_parents=config.max_parents)
+        return from_callable(network, *distinct, weights=weights, num_values=num_values, search=search, **described)
+    return from_experience(
+        *distinct,
+        weights=weights,
+        num_values=num_values,
+        num_actions=len(described["action_names"]),
+        search=Search(score=config.score, max_parents=config.max_parents, max_next=1),
+        prior_count=config.prior_count,
+        **described,
     )
 
 

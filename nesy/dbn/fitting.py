@@ -21,6 +21,7 @@ def from_experience(
     *,
     num_values: int,
     num_actions: int | None = None,
+    weights: np.ndarray | None = None,
     search: Search | None = None,
     prior_count: float = 1.0,
     **described: Any,
@@ -33,6 +34,7 @@ def from_experience(
         next_codes: uint8 [n, N].
         num_values: K.
         num_actions: A; by default the largest action met, plus one.
+        weights: int64 [n], how often each transition was met; once each by default.
         search: how parents are chosen; by default BDeu, up to 4 parents from slice t and 1 from slice t+1.
         prior_count: transitions that each row's prior counts as; the prior is the factor's distribution under
             the action, so a row never met is that.
@@ -43,6 +45,7 @@ def from_experience(
     """
     search = search or Search(max_next=1)
     codes, next_codes = np.asarray(codes), np.asarray(next_codes)
+    often = np.ones(len(codes), dtype=np.int64) if weights is None else weights
     _check(codes, num_values)
     number = num_actions or int(np.max(actions)) + 1
     n = codes.shape[1]
@@ -50,19 +53,20 @@ def from_experience(
     parents: list[list[tuple[int, ...]]] = []
     tables: list[list[np.ndarray]] = []
     for a in range(number):
-        both = np.column_stack([codes, next_codes])[np.asarray(actions) == a]
-        first, _, weights = unique_rows(both)
-        kinds = both[first]
+        here = np.asarray(actions) == a
+        both = np.column_stack([codes, next_codes])[here]
+        first, index, _ = unique_rows(both)
+        kinds, visits = both[first], np.bincount(index, often[here], len(first))
         parents.append([])
         tables.append([])
         for i in range(n):
             # within slice t+1 the order is that of the factors: factor i may look at those before it
             columns = kinds[:, : n + i]
             child = eye[kinds[:, n + i]]
-            chosen = learn_parents(columns, child, weights.astype(float), num_values, (n, n + i), search)
+            chosen = learn_parents(columns, child, visits, num_values, (n, n + i), search)
             parents[-1].append(chosen)
-            tables[-1].append(_count(columns[:, list(chosen)], child, weights, num_values, prior_count))
-    taken = (codes, np.asarray(actions), next_codes, np.ones(len(codes), dtype=np.int64))
+            tables[-1].append(_count(columns[:, list(chosen)], child, visits, num_values, prior_count))
+    taken = (codes, np.asarray(actions), next_codes, often)
     return _assemble(tables, parents, n, taken, num_values, described)
 
 

@@ -110,7 +110,8 @@ def known_part(dbn: TwoSliceDBN, least: float = 0.0) -> TwoSliceDBN:
         UserError: a table would become too large.
     """
     k = dbn.num_values
-    tables, counts = [], []
+    tables: list[list[np.ndarray]] = []
+    counts: list[list[np.ndarray]] = []
     for a in range(dbn.num_actions):
         tables.append([])
         counts.append([])
@@ -123,9 +124,9 @@ def known_part(dbn: TwoSliceDBN, least: float = 0.0) -> TwoSliceDBN:
             keep = (tensor >= least) & (visits[inner] > 0)[..., None]
             table = np.zeros((k + 1,) * (arity + 1))
             table[..., k] = 1.0
-            table[(*inner, slice(0, k))] = np.where(keep, tensor, 0.0)
+            table[..., :k][inner] = np.where(keep, tensor, 0.0)
             # the sum of what is dropped, not 1 less what is kept: rounding must not lead anywhere
-            table[(*inner, k)] = np.where(keep, 0.0, tensor).sum(axis=-1)
+            table[..., k][inner] = np.where(keep, 0.0, tensor).sum(axis=-1)
             tables[-1].append(table.reshape(-1, k + 1))
             counts[-1].append(visits.reshape(-1))
     meanings = [[*texts, ELSEWHERE] for texts in dbn.value_meanings]

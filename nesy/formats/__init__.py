@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import importlib
+import inspect
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+
+import numpy as np
 
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
@@ -41,26 +45,66 @@ FORMATS: dict[str, Format] = {
 }
 
 
-def export(dbn: TwoSliceDBN, path: Path | str, format: str | None = None, **options: Any) -> None:
+def export(
+    dbn: TwoSliceDBN,
+    path: Path | str,
+    format: str | None = None,
+    *,
+    cone: Iterable[int] | None = None,
+    known: float | None = None,
+    **options: Any,
+) -> None:
     """Write a model in one of `FORMATS`.
 
     Args:
         dbn: the model.
         path: where to write; a file, or a folder for `native`.
         format: a key of `FORMATS`; by default the one that the path's ending tells.
+        cone: write only these factors and what they depend on (nesy.dbn.parts.cone_of); a `start` among the options
+            and a `goal` are those of the whole model.
+        known: write only the rows met, their entries from this probability on, the rest as one more value of every
+            factor (nesy.dbn.parts.known_part).
         options: what the format's `write` takes besides (a start, goals, ...).
 
     Raises:
         UserError: no such format, or the model has something that the format cannot hold.
     """
     path = Path(path)
-    name = _format_of(path, format)
+    name = format_of(path, format)
     if FORMATS[name].suffix and path.is_dir():
         raise UserError(f"{path}: is a folder; the format '{name}' is one file")
+    write = _module(name).write
+    for option in options:
+        if option not in inspect.signature(write).parameters:
+            raise UserError(f"{path}: the format '{name}' has no place for the option '{option}'")
+    if cone is not None:
+        dbn, options = _cut(dbn, cone, options)
+    if known is not None:
+        from nesy.dbn.parts import known_part
+
+        dbn = known_part(dbn, known)
     try:
-        _module(name).write(dbn, path, **options)
+        write(dbn, path, **options)
     except OSError as error:
         raise UserError(f"{path}: cannot be written ({error.strerror or error})") from None
+
+
+def _cut(dbn: TwoSliceDBN, cone: Iterable[int], options: dict[str, Any]) -> tuple[TwoSliceDBN, dict[str, Any]]:
+    """The cone of influence, and the options in its factors."""
+    from nesy.dbn.parts import cone_of
+
+    part = cone_of(dbn, cone)
+    kept = [dbn.factor_names.index(name) for name in part.factor_names]
+    moved = dict(options)
+    if options.get("start") is not None:
+        moved["start"] = np.asarray(options["start"])[kept]
+    if options.get("goals") is not None:
+        moved["goals"] = np.unique(np.asarray(options["goals"])[:, kept], axis=0)
+    if options.get("factors") is not None:
+        moved["factors"] = [kept.index(i) for i in options["factors"]]
+    if options.get("goal"):
+        moved["goal"] = {kept.index(i): value for i, value in options["goal"].items()}
+    return part, moved
 
 
 def read(path: Path | str, format: str | None = None) -> TwoSliceDBN:
@@ -72,7 +116,7 @@ def read(path: Path | str, format: str | None = None) -> TwoSliceDBN:
     path = Path(path)
     if not path.exists():
         raise UserError(f"{path}: no such file or folder")
-    name = _format_of(path, format)
+    name = format_of(path, format)
     if not FORMATS[name].readable:
         known = ", ".join(key for key, f in FORMATS.items() if f.readable)
         raise UserError(f"{path}: the format '{name}' cannot be read back; these can: {known}")
@@ -80,7 +124,12 @@ def read(path: Path | str, format: str | None = None) -> TwoSliceDBN:
     return dbn
 
 
-def _format_of(path: Path, format: str | None) -> str:
+def format_of(path: Path, format: str | None) -> str:
+    """The key of `FORMATS` that a format's name or a path's ending tells.
+
+    Raises:
+        UserError: there is none.
+    """
     if format is None:
         format = next((key for key, f in FORMATS.items() if f.suffix == path.suffix.lower()), None)
         if format is None:

@@ -173,4 +173,4 @@ def _plan(result: Executed, dbn: TwoSliceDBN, code: np.ndarray, goals: np.ndarra
         result.plans |= {there: plan[step + 1 :] for step, (_, there) in enumerate(plan or ())}
         result.calls += 1
         result.unsolved += plan is None
-    return list(result.plans[place] or ())
+    return list(result.plans.get(place) or ())
