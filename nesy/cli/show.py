@@ -1,4 +1,4 @@
-"""Draw the 2DBN: its graph per action, or what the values of one factor look like; and print its tables."""
+"""Print or draw the 2DBN: its graph, a factor's table with what its values look like, its trees, its fidelity."""
 
 from __future__ import annotations
 
@@ -19,16 +19,20 @@ if TYPE_CHECKING:
 class Arguments:
     """Options of `nesy show`."""
 
-    what: Annotated[Literal["dbn"], tyro.conf.Positional] = "dbn"
-    """What to show."""
+    what: Annotated[Literal["dbn", "fidelity"], tyro.conf.Positional] = "dbn"
+    """What to show: the model, or the report of how far it can be trusted."""
     run: Path = Path("runs/default")
     """The run folder."""
     factor: int | None = None
     """Show this factor: its tables, and a picture of what each of its values looks like."""
     action: str | None = None
     """Show this action only."""
+    tree: bool = False
+    """Print the tables of --factor as decision trees over the parents: only what was met, equal values together."""
+    tolerance: float = 0.0
+    """Total variation up to which --tree puts rows together; the error made is stated."""
     to: Path | None = None
-    """Draw into this file, .png or .svg: the graph, or the values of --factor."""
+    """Draw into this file, .png or .svg: the graph, or the values and tables of --factor."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print the result as one JSON object on standard output."""
 
@@ -37,18 +41,56 @@ def run(options: Arguments) -> dict[str, Any]:
     """Print the table; draw the picture where --to is given."""
     folder = RunFolder.open(options.run)
     folder.require("extract")
+    if options.what == "fidelity":
+        return _fidelity(folder, options)
     from nesy.dbn import Codebook, TwoSliceDBN, describe
 
     dbn = TwoSliceDBN.load(folder.dbn)
     factor, action = selection(dbn, options.factor, options.action)
-    result = {"table": describe(dbn, factor=factor, action=action)}
+    if options.tree:
+        return {"table": _trees(dbn, factor, action, options.tolerance)}
+    parts = [describe(dbn, factor=factor, action=action)]
+    if factor is not None:
+        from nesy.dbn.thumbnails import thumbnails
+
+        parts.insert(0, thumbnails(dbn, Codebook.load(folder.dbn), factor))
+    result = {"table": "\n\n".join(parts)}
     if options.to is not None:
         from nesy.dbn.drawing import draw_factor, draw_graph
 
         if factor is None:
             draw_graph(dbn, options.to, action)
         else:
-            draw_factor(dbn, Codebook.load(folder.dbn), factor, options.to)
+            draw_factor(dbn, Codebook.load(folder.dbn), factor, options.to, action)
+        result["drawn"] = str(options.to)
+    return result
+
+
+def _trees(dbn: TwoSliceDBN, factor: int | None, action: int | None, tolerance: float) -> str:
+    from nesy.dbn.trees import conditional_tree, describe_tree
+
+    if factor is None:
+        raise UserError("--tree: name the factor with --factor")
+    if not 0 <= tolerance < 1:
+        raise UserError(f"--tolerance {tolerance}: a total variation lies in [0, 1)")
+    actions = range(dbn.num_actions) if action is None else (action,)
+    trees = [(a, conditional_tree(dbn, a, factor, tolerance, met_only=True)) for a in actions]
+    return "\n\n".join(describe_tree(dbn, a, factor, tree) for a, tree in trees)
+
+
+def _fidelity(folder: RunFolder, options: Arguments) -> dict[str, Any]:
+    from nesy.report.text import flat, number
+
+    report = folder.read_summary().get("dbn", {}).get("fidelity")
+    if report is None:
+        raise UserError(f"{folder.path}: has no fidelity report; make it with: nesy extract --run {folder.path} --redo")
+    rows = flat(report)
+    width = max(len(name) for name, _ in rows)
+    result: dict[str, Any] = {"table": "\n".join(f"{name.ljust(width)}  {number(value)}" for name, value in rows)}
+    if options.to is not None:
+        from nesy.dbn.fidelity_drawing import draw_fidelity
+
+        draw_fidelity(report, options.to)
         result["drawn"] = str(options.to)
     return result
 

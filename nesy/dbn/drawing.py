@@ -75,35 +75,64 @@ def _panel(dbn: TwoSliceDBN, action: int, axis: Axes) -> None:
     axis.axis("off")
 
 
-def draw_factor(dbn: TwoSliceDBN, codebook: Codebook, factor: int, path: Path | str) -> None:
-    """Draw what each value of a factor looks like: the mean of the views that have it, and what it means.
+def draw_factor(
+    dbn: TwoSliceDBN, codebook: Codebook, factor: int, path: Path | str, action: int | None = None, most_rows: int = 14
+) -> None:
+    """Draw what each value of a factor looks like and what it means, and below the rows of its table met most often.
 
-    Each cell is the mean colour of its kinds over those views; how many they are stands below.
+    Each cell of a view is the mean colour of its kinds over the views that have the value; how many they are stands
+    below. Rows of a table are darker where the factor's next value is more probable.
 
     Raises:
-        UserError: no such factor, or an ending that is no picture format.
+        UserError: no such factor or action, or an ending that is no picture format.
     """
     from matplotlib.figure import Figure
 
     if not 0 <= factor < dbn.num_factors:
         raise UserError(f"no factor {factor}; the factors are 0 to {dbn.num_factors - 1}")
-    figure = Figure(figsize=(1.6 * dbn.num_values, 2.6), layout="constrained")
-    axes = figure.subplots(1, dbn.num_values, squeeze=False)[0]
-    for value, axis in enumerate(axes):
-        chosen = codebook.codes[:, factor] == value
-        axis.set_xticks([])
-        axis.set_yticks([])
-        axis.set_title(f"{dbn.factor_names[factor]} = {value}", fontsize=9)
-        if chosen.any():
-            # views are indexed [vx, vy]; pictures have the row first
-            axis.imshow(mean_view(codebook.views[chosen]).transpose(1, 0, 2))
-            meaning = dbn.value_meanings[factor][value] if dbn.value_meanings else ""
-            lines = [line for part in meaning.split(", ") for line in textwrap.wrap(part, 26)]
-            axis.set_xlabel("\n".join([f"{int(chosen.sum())} views", *lines]), fontsize=6)
-        else:
-            axis.set_xlabel("not met", fontsize=6)
-    figure.suptitle(f"Values of {dbn.factor_names[factor]}", fontsize=10)
+    if action is not None and not 0 <= action < dbn.num_actions:
+        raise UserError(f"no action {action}; the actions are {', '.join(dbn.action_names)}")
+    actions = range(dbn.num_actions) if action is None else (action,)
+    figure = Figure(figsize=(max(1.6 * dbn.num_values, 3.4 * len(actions)), 6.4), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=(2.6, 3.8))
+    for value, axis in enumerate(above.subplots(1, dbn.num_values, squeeze=False)[0]):
+        _value(dbn, codebook, factor, value, axis)
+    above.suptitle(f"Values of {dbn.factor_names[factor]}", fontsize=10)
+    for a, axis in zip(actions, below.subplots(1, len(actions), squeeze=False)[0], strict=True):
+        _table(dbn, factor, a, axis, most_rows)
     save_figure(figure, path)
+
+
+def _value(dbn: TwoSliceDBN, codebook: Codebook, factor: int, value: int, axis: Axes) -> None:
+    chosen = codebook.codes[:, factor] == value
+    axis.set_xticks([])
+    axis.set_yticks([])
+    axis.set_title(f"{dbn.factor_names[factor]} = {value}", fontsize=9)
+    if not chosen.any():
+        axis.set_xlabel("not met", fontsize=6)
+        return
+    # views are indexed [vx, vy]; pictures have the row first
+    axis.imshow(mean_view(codebook.views[chosen]).transpose(1, 0, 2))
+    side = codebook.views.shape[1]
+    axis.plot(side // 2, side - 1, "^", color="#D55E00", markersize=5)
+    meaning = dbn.value_meanings[factor][value] if dbn.value_meanings else ""
+    lines = [line for part in meaning.split(", ") for line in textwrap.wrap(part, 26)]
+    axis.set_xlabel("\n".join([f"{int(chosen.sum())} views", *lines]), fontsize=6)
+
+
+def _table(dbn: TwoSliceDBN, factor: int, action: int, axis: Axes, most_rows: int) -> None:
+    counts = dbn.counts(action, factor)
+    rows = np.argsort(-counts, kind="stable")[:most_rows]
+    parents = dbn.parents(action, factor)
+    digits = np.stack(np.unravel_index(rows, (dbn.num_values,) * len(parents)), axis=1) if parents else None
+    texts = ["" if digits is None else " ".join(map(str, digits[r].tolist())) for r in range(len(rows))]
+    axis.imshow(dbn.cpt(action, factor)[rows], cmap="Blues", vmin=0, vmax=1, aspect="auto")
+    axis.set_yticks(range(len(rows)), [f"{t}  ({counts[r]})" for t, r in zip(texts, rows, strict=True)], fontsize=6)
+    axis.set_xticks(range(dbn.num_values))
+    axis.tick_params(axis="x", labelsize=6)
+    names = " ".join(dbn.factor_names[p] + ("'" if where else "") for where, p in parents) or "no parents"
+    axis.set_title(f"{dbn.action_names[action]}: {names} (visits)", fontsize=7)
+    axis.set_xlabel(f"next {dbn.factor_names[factor]}", fontsize=7)
 
 
 def mean_view(views: np.ndarray) -> np.ndarray:

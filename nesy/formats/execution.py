@@ -170,7 +170,8 @@ def _plan(result: Executed, dbn: TwoSliceDBN, code: np.ndarray, goals: np.ndarra
         plan = by_fast_downward(dbn, code, goals, outcomes)
         result.plans[place] = plan
         # what remains of a plan is the plan from the codes on its way
-        result.plans |= {there: plan[step + 1 :] for step, (_, there) in enumerate(plan or ())}
+        for step, (_, there) in enumerate(plan or []):
+            result.plans[there] = (plan or [])[step + 1 :]
         result.calls += 1
         result.unsolved += plan is None
     return list(result.plans.get(place) or ())
