@@ -6,9 +6,7 @@ Colours are Okabe and Ito's, which stay apart for colour-blind readers.
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import matplotlib
 import numpy as np
@@ -57,43 +55,6 @@ def svg(figure: Figure) -> str:
     plt.close(figure)  # a no-op for figures made without pyplot
     text = buffer.getvalue()
     return text[text.index("<svg") :]
-
-
-def comparison(cells: Sequence[dict[str, Any]]) -> str:
-    """Mean return of every cell with its interval, and the exact optimum as a line."""
-    figure, axes = plt.subplots(figsize=(8, 0.42 * len(cells) + 1.0))
-    labels = [" / ".join(filter(None, (c["agent"], c.get("inputs"), c.get("influence")))) for c in cells]
-    agents = list(dict.fromkeys(cell["agent"] for cell in cells))
-    for row, cell in enumerate(cells):
-        figures, colour = cell["return"], PALETTE[agents.index(cell["agent"]) % len(PALETTE)]
-        if figures.get("low") is not None:
-            axes.plot([figures["low"], figures["high"]], [row, row], color=colour, linewidth=2)
-        axes.plot(figures["mean"], row, "o", color=colour)
-        if cell["agent"] == "optimum":
-            axes.axvline(figures["mean"], color="#000000", linestyle=":", linewidth=1)
-    axes.set_yticks(range(len(cells)), labels)
-    axes.invert_yaxis()
-    axes.set_xlabel("return per episode (mean, 95 % interval; dotted: exact optimum)")
-    axes.grid(axis="x", alpha=0.3)
-    return svg(figure)
-
-
-def learning_curves(curves: dict[str, np.ndarray], optimum: float | None, window: int) -> str:
-    """Running mean of the training return over `window` episodes, one line per name."""
-    figure, axes = plt.subplots(figsize=(8, 4))
-    for position, (name, returns) in enumerate(curves.items()):
-        width = min(window, len(returns))
-        total = np.cumsum(np.concatenate([[0.0], returns]))
-        mean = (total[width:] - total[:-width]) / width
-        episodes = np.arange(width, len(returns) + 1)
-        axes.plot(episodes, mean, color=PALETTE[position % len(PALETTE)], label=f"{name} ({len(returns)} episodes)")
-    if optimum is not None:
-        axes.axhline(optimum, color="#000000", linestyle=":", linewidth=1, label="exact optimum")
-    axes.set_xlabel("training episode")
-    axes.set_ylabel(f"return, mean of the last {window}")
-    axes.grid(alpha=0.3)
-    axes.legend(loc="best", fontsize=9)
-    return svg(figure)
 
 
 def belief_panel(example: BeliefExample) -> str:

@@ -13,6 +13,7 @@ COMPARISON_COLUMNS = (
     "success",
     "of optimum",
     "ms/decision",
+    "learned from",
     "episodes",
 )
 
@@ -32,7 +33,10 @@ def comparison_rows(cells: list[dict[str, Any]]) -> list[tuple[str, ...]]:
                 interval(cell["success"], 3),
                 "" if share is None else f"{100 * share:.1f} %",
                 f"{cell['ms_per_decision']:.3g}",
-                str(cell["episodes"]),
+                f"{cell['experience_steps']:,}" if cell.get("experience_steps") else "",
+                f"{cell['episodes']} ({len(cell['seeds'])} seeds)"
+                if len(cell.get("seeds", ())) > 1
+                else str(cell["episodes"]),
             )
         )
     return rows
