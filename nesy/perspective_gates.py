@@ -12,11 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from domains.core import UNSEEN, WALL, Domain, DomainError, ViewGeometry
-from nesy.perspective import PerspectiveShift
+from domains.core import UNSEEN, WALL, Domain, DomainError, ViewGeometry, load_domain
+from nesy.experience import held_out as drawn_maps
+from nesy.experience import load_columns
+from nesy.perspective import PerspectiveShift, TableModel
+from nesy.run_folder import RunFolder
 from nesy.walks import recalled
 from nesy.world_model.codec import SymbolicCodec
 from nesy.world_model.distinct import view_keys
+from nesy.world_model.storage import load_world_model
 
 
 @dataclass(frozen=True)
@@ -78,48 +82,123 @@ def _pairs(cells: np.ndarray, here: np.ndarray, views: np.ndarray, geometry: Vie
     return np.stack([here[own], configuration, here[other]]).astype(np.int64)
 
 
-def evaluate_shift(codec: SymbolicCodec, cases: Situations, planner: str = "table") -> dict[str, Any]:
-    """Φ against the true views and the best possible.
+def situations_met(views: np.ndarray, configurations: np.ndarray, person_views: np.ndarray) -> Situations | None:
+    """The situations of some moments: own views [n, v, v], configurations [n], true views [n, v, v].
+
+    None where the other agent is never in view.
+    """
+    seen = np.flatnonzero(configurations > 0)
+    if not len(seen):
+        return None
+    both = np.concatenate([views[seen], person_views[seen]])
+    unique, first, index = np.unique(view_keys(both), return_index=True, return_inverse=True)
+    own, true = np.split(index.astype(np.int64), 2)
+    size = int(configurations.max()) + 1
+    combined, weight = np.unique(
+        (own * size + configurations[seen].astype(np.int64)) * len(unique) + true, return_counts=True
+    )
+    pairs, pair = np.unique(combined // len(unique), return_inverse=True)
+    distinct = both[first]
+    return Situations(distinct[pairs // size], pairs % size, pair, distinct[combined % len(unique)], weight)
+
+
+def evaluate_run(run: RunFolder, domain_name: str, variant: str, seed: int, held_out: float) -> dict[str, Any]:
+    """Φ of a run's model, for summary.json: on all situations of the variant, or else on held-out experience.
+
+    Args:
+        run: with experience and a world model, and its 2DBN where the world model has no tables.
+        domain_name: of the run.
+        variant: of the domain.
+        seed: of the run, which drew the held-out maps.
+        held_out: share of the maps that training left out.
 
     Returns:
-        `shift`, `best`, `random`: for each `exact` (likeliest view right), `cells`, `cells_seen` and
-        `cells_unseen` (cells that the own view does or does not show), `factors` (likeliest values right) and
-        `kl` (of b~ to the code of the true view, nats, summed over factors); `reachable`, the share of situations
-        with a way; `by_steps`: exact and kl of shift and best per number of imagined actions.
+        As `evaluate_shift`, with `planner`, `situations` (how many) and `on`: `all maps` or `held-out maps`. The best
+        possible is left out on held-out maps, where counting a few situations would not give it. Where the world
+        model has no tables, `extracted` has the figures of the 2DBN with the planner `table`. Empty where the other
+        agent is never in view.
     """
-    shifted = PerspectiveShift(codec, planner)(codec.beliefs(cases.own), cases.configuration)
-    best_views, best_beliefs = _posterior(codec, cases)
+    codec = SymbolicCodec(load_world_model(run.world_model))
+    cases, on = situations(load_domain(domain_name), variant), "all maps"
+    if cases is None:
+        columns = load_columns(run.experience, ("view", "configuration", "person_view", "map_id"))
+        maps = np.unique(columns["map_id"])
+        rows = np.isin(columns["map_id"], drawn_maps(maps, held_out, np.random.default_rng(seed)))
+        cases = situations_met(*(columns[name][rows] for name in ("view", "configuration", "person_view")))
+        on = "held-out maps"
+        if cases is None:
+            return {}
+    planner = "network" if codec.packed() is None else "table"
+    bound = on == "all maps"
+    figures = {"on": on, "situations": int(cases.weight.sum()), "planner": planner}
+    figures |= evaluate_shift(codec, cases, PerspectiveShift(codec, planner), bound=bound)
+    if planner == "network":
+        from nesy.dbn import Codebook, TwoSliceDBN
+
+        book = Codebook.load(run.dbn)
+        codes, first = np.unique(book.codes, axis=0, return_index=True)
+        tables = TableModel(TwoSliceDBN.load(run.dbn), codes, book.views[first])
+        extracted = evaluate_shift(codec, cases, PerspectiveShift(tables, "table"), bound=False)
+        figures["extracted"] = extracted["shift"]
+    return figures
+
+
+def evaluate_shift(
+    codec: SymbolicCodec, cases: Situations, shift: PerspectiveShift, *, bound: bool = True
+) -> dict[str, Any]:
+    """Φ against the true views, a random belief, and the best possible.
+
+    Args:
+        codec: encodes the views.
+        cases: where to shift.
+        shift: Φ.
+        bound: whether `cases` hold all situations, so that counting them gives the posterior.
+
+    Returns:
+        `reachable`, the share of situations with a way; the others are left out. `shift`, `random` and, with `bound`,
+        `best`: for each `exact` (likeliest view right), `cells`, `cells_seen` and `cells_unseen` (cells that the own
+        view does or does not show), `factors` (likeliest values right) and `kl` (of the code of the true view from
+        b~, nats, summed over factors, at most 13.8 for each). `by_steps` and `by_distance`: `share`, `exact`,
+        `cells` and `kl` of each, per number of imagined actions and per cells ahead and aside.
+    """
+    shifted = shift(codec.beliefs(cases.own), cases.configuration)
     rng = np.random.default_rng(0)
     codes = rng.integers(0, codec.num_values, (len(cases.own), codec.num_factors)).astype(np.uint8)
     uniform = np.full_like(shifted.beliefs, 1.0 / codec.num_values)
-    seen = _seen(cases)
     guesses = {
-        "shift": (codec.views(shifted.codes), shifted.beliefs),
-        "best": (best_views, best_beliefs),
+        "shift": (shift.model.views(shifted.codes), shifted.beliefs),
         "random": (codec.views(codes), uniform),
     }
+    if bound:
+        guesses["best"] = _posterior(codec, cases)
     reached = shifted.reachable[cases.pair]
+    weight = np.where(reached, cases.weight, 0).astype(np.float64)
+    side, ahead, _ = ViewGeometry(cases.own.shape[1]).relative(cases.configuration).T
+    groups = {"by_steps": shifted.num_actions[cases.pair], "by_distance": (abs(side) + ahead)[cases.pair]}
     figures: dict[str, Any] = {"reachable": float(np.average(reached, weights=cases.weight))}
-    steps = shifted.num_actions[cases.pair]
-    by_steps: dict[str, dict[str, float]] = {}
+    figures |= {name: {} for name in groups}
+    seen = _seen(cases)
     for name, (views, beliefs) in guesses.items():
         scores = _scores(codec, cases, views, beliefs, seen)
-        weight = np.where(reached, cases.weight, 0)
         figures[name] = {
-            "exact": float(np.average(scores["exact"], weights=weight)),
-            "cells": float(np.average(scores["cells"], weights=weight)),
+            "exact": _mean(scores["exact"], weight),
+            "cells": _mean(scores["cells"], weight),
             "cells_seen": _share(scores["right_seen"], scores["seen"], weight),
             "cells_unseen": _share(scores["right_unseen"], scores["unseen"], weight),
-            "factors": float(np.average(scores["factors"], weights=weight)),
-            "kl": float(np.average(scores["kl"], weights=weight)),
+            "factors": _mean(scores["factors"], weight),
+            "kl": _mean(scores["kl"], weight),
         }
-        for count in np.unique(steps[reached]):
-            now = np.where(steps == count, weight, 0)
-            entry = by_steps.setdefault(str(int(count)), {"share": float(now.sum() / weight.sum())})
-            if name != "random":
-                entry[f"exact_{name}"] = float(np.average(scores["exact"], weights=now))
-                entry[f"kl_{name}"] = float(np.average(scores["kl"], weights=now))
-    return {**figures, "by_steps": by_steps}
+        for group, number in groups.items():
+            mass = np.bincount(number, weight)
+            sums = {score: np.bincount(number, weight * scores[score]) for score in ("exact", "cells", "kl")}
+            for value in np.flatnonzero(mass):
+                entry = figures[group].setdefault(str(value), {"share": float(mass[value] / weight.sum())})
+                entry[name] = {score: float(sums[score][value] / mass[value]) for score in sums}
+    return figures
+
+
+def _mean(score: np.ndarray, weight: np.ndarray) -> float:
+    return float((score * weight).sum() / weight.sum()) if weight.sum() else 0.0
 
 
 def _posterior(codec: SymbolicCodec, cases: Situations) -> tuple[np.ndarray, np.ndarray]:
