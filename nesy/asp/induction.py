@@ -128,38 +128,32 @@ def _general(allowed: np.ndarray, values: np.ndarray, truth: np.ndarray) -> np.n
             if other != column:
                 others &= fits[other]
         # values never met in this context stay out: a rule should not promise more than was seen
-        for value in np.flatnonzero(~result[column]).tolist():
-            here = others & (values[:, column] == value)
-            if here.any() and not (here & ~truth).any():
-                result[column, value] = True
+        met = np.bincount(values[others, column], minlength=result.shape[1])
+        wrongly = np.bincount(values[others & ~truth, column], minlength=result.shape[1])
+        result[column] |= (met > 0) & (wrongly == 0)
         fits[column] = result[column][values[:, column]]
     return result
 
 
 def _needed(masks: list[np.ndarray], values: np.ndarray, truth: np.ndarray) -> tuple[Rule, ...]:
     """The rules that cover what the others do not, those that cover most first."""
-    columns = np.arange(values.shape[1])
-    covers = []
-    for mask in masks:
-        here = np.ones(len(values), dtype=bool)
-        for column in np.flatnonzero(~mask.all(axis=1)).tolist():
+    covers = np.ones((len(masks), len(values)), dtype=bool)
+    narrow = [np.flatnonzero(~mask.all(axis=1)).tolist() for mask in masks]
+    for here, mask, columns in zip(covers, masks, narrow, strict=True):
+        for column in columns:
             here &= mask[column][values[:, column]]
-        covers.append(here)
-    met = [np.unique(values[:, c]) for c in columns]
     rules: list[Rule] = []
-    covered = np.zeros(len(values), dtype=bool)
-    remaining = set(range(len(masks)))
-    while remaining:
-        gain = {j: int((covers[j] & truth & ~covered).sum()) for j in remaining}
-        best = min(remaining, key=lambda j: (-gain[j], j))
+    left = truth.copy()
+    while len(masks):
+        gain = (covers & left).sum(axis=1)
+        best = int(gain.argmax())
         if not gain[best]:
             break
-        remaining.remove(best)
-        covered |= covers[best]
-        conditions = tuple(
-            (int(c), tuple(int(v) for v in met[c] if masks[best][c, v]))
-            for c in columns
-            if not masks[best][c, met[c]].all()
-        )
-        rules.append(Rule(conditions, int((covers[best] & truth).sum()), int(covers[best].sum())))
+        left &= ~covers[best]
+        conditions = []
+        for column in narrow[best]:
+            met = np.unique(values[:, column])
+            if not masks[best][column, met].all():
+                conditions.append((int(column), tuple(int(v) for v in met if masks[best][column, v])))
+        rules.append(Rule(tuple(conditions), int((covers[best] & truth).sum()), int(covers[best].sum())))
     return tuple(rules)

@@ -53,10 +53,13 @@ class RuleSet:
 def applies(rules: Sequence[Rule], values: np.ndarray) -> np.ndarray:
     """Where some rule applies: bool [n] for values integers [n, C]."""
     result = np.zeros(len(values), dtype=bool)
+    table = np.zeros(int(values.max(initial=0)) + 1, dtype=bool)
     for rule in rules:
         here = np.ones(len(values), dtype=bool)
         for column, allowed in rule.conditions:
-            here &= np.isin(values[:, column], allowed)
+            table[:] = False
+            table[[v for v in allowed if v < len(table)]] = True
+            here &= table[values[:, column]]
         result |= here
     return result
 

@@ -64,7 +64,7 @@ def scores(
             partial(predicate_rules, codebook, name, held_out=0.0, num_values=num_values),
             codebook.codes.astype(np.int64),
             codebook.predicate(name),
-            divisions,
+            divisions if name in supported else {},
             factor_names,
             predicates=False,
         )

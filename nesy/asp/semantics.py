@@ -22,6 +22,10 @@ from nesy.dbn.codebook import Codebook
 from nesy.dbn.rows import unique_rows
 from nesy.errors import UserError
 
+COARSE = 150
+"""Where a value has no short exact form, a leaf of its tree holds at least this part of the views: rough and short
+rather than exact and long."""
+
 _PLACE = re.compile(r"_\d+_\d+$")
 
 
@@ -84,7 +88,7 @@ def _value_rules(columns: np.ndarray, truth: np.ndarray) -> tuple[Rule, ...]:
         if form is not None:
             rules = [counted([(c, (int(holds),)) for c, holds in one], values, truth) for one in form]
             return tuple(sorted(rules, key=lambda rule: -rule.right))
-    return induce(values, truth, 2)
+    return induce(values, truth, 2, min_leaf=max(1, len(values) // COARSE))
 
 
 def ordered(predicates: Sequence[str]) -> tuple[str, ...]:

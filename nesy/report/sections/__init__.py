@@ -5,7 +5,18 @@ A section is a module with ANCHOR, TITLE and `make(run, summary) -> HTML`, made 
 
 from types import ModuleType
 
-from nesy.report.sections import belief, comparison, dbn, fidelity, graph, learning, provenance, replays, world_model
+from nesy.report.sections import (
+    belief,
+    comparison,
+    dbn,
+    fidelity,
+    graph,
+    learning,
+    provenance,
+    replays,
+    semantics,
+    world_model,
+)
 
 SECTIONS: tuple[ModuleType, ...] = (
     comparison,
@@ -13,6 +24,7 @@ SECTIONS: tuple[ModuleType, ...] = (
     replays,
     belief,
     world_model,
+    semantics,
     graph,
     dbn,
     fidelity,
