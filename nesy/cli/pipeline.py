@@ -249,7 +249,18 @@ class Pipeline:
             )
             self.run.update_summary(dbn=figures)
             self._evaluate_shift()
+            self._evaluate_semantics()
         return dict(self.run.read_summary()["dbn"])
+
+    def _evaluate_semantics(self) -> None:
+        """Measure how well short rules say what codes mean."""
+        from nesy.asp.run_semantics import semantics_report
+
+        config = self.config
+        figures = self._timed(
+            "semantics", lambda: semantics_report(self.run, config.domain, config.variant, config.seed)
+        )
+        self.run.update_summary(semantics=figures)
 
     def _evaluate_shift(self) -> None:
         """Measure the perspective shift, which takes the world model and, for some architectures, the 2DBN."""
