@@ -1,6 +1,6 @@
 """Next-code NLL against the largest number of parents, with and without arcs inside slice t+1.
 
-For every limit the codes of a run's world model are refined anew from noise, so that each limit has codes that
+For every limit a code book is searched anew, named factors and completing ones, so that each limit has codes that
 suit it, and the tables are counted and smoothed as in training. Prints a Markdown table.
 
     python scripts/parents_table.py --run runs/demo
@@ -19,12 +19,14 @@ from domains.core import load_domain
 from nesy.cli import configuration
 from nesy.experience import Experience
 from nesy.run_folder import RunFolder
-from nesy.world_model import SymbolicCodec, Transitions, load_world_model, reference_transitions
-from nesy.world_model.distinct import transitions_of, view_keys
+from nesy.world_model import Transitions, reference_transitions
+from nesy.world_model.code_search import CodeSearch
+from nesy.world_model.distinct import transitions_of, view_keys, with_mirror
 from nesy.world_model.gates import limits
+from nesy.world_model.questions import Questions
 from nesy.world_model.refinement import CodeBook, Refiner
 from nesy.world_model.structure import Limits
-from nesy.world_model.symbolic_training import MOST_PARENTS, NOISE
+from nesy.world_model.symbolic_training import MOST_PARENTS
 from nesy.world_model.tables import all_tables, log_probability
 
 
@@ -33,11 +35,13 @@ class Arguments:
     """Options of the script."""
 
     run: Path = Path("runs/default")
-    """A run with experience and a symbolic world model."""
-    rounds: int = 12
-    """Rounds of refinement for each limit."""
+    """A run with experience."""
+    epochs: int = 60
+    """As in training: a sixth of them are rounds of questions, half of them rounds of the codes."""
+    named_factors: int = 6
+    """As in training."""
     seed: int = 0
-    """Seed of the refinement."""
+    """Seed of the search."""
 
 
 def nll_on(book: CodeBook, transitions: Transitions, reference: Transitions) -> float:
@@ -52,16 +56,16 @@ def nll_on(book: CodeBook, transitions: Transitions, reference: Transitions) -> 
 def main(arguments: Arguments) -> None:
     """Print the table."""
     run = RunFolder.open(arguments.run)
-    run.require("collect", "train")
+    run.require("collect")
     config = configuration.load(run.config)
     domain = load_domain(config.domain)
     reference = reference_transitions(domain, config.variant, "crossing")
     following = reference_transitions(domain, config.variant, "following")
     views = following.views if following is not None else None
-    transitions = transitions_of(Experience.load(run.experience), views=views)
+    transitions = with_mirror(transitions_of(Experience.load(run.experience), views=views))
     reference = transitions if reference is None else reference
-    start = SymbolicCodec(load_world_model(run.world_model)).codes(transitions.views).astype(np.int64)
-    free = np.zeros((len(start), 8, 8))
+    truth = domain.predicates.evaluate(transitions.views)
+    questions = Questions.of(domain.predicates.names, truth, config.train.headline)
     print(f"limit of the data: {limits(reference)['next_code_nll']:.3f} nats (all maps, poses and actions)\n")
     print("| parents from slice t | arcs inside t+1 | NLL, nats | counted NLL on the experience | rows | seconds |")
     print("| --- | --- | --- | --- | --- | --- |")
@@ -71,10 +75,9 @@ def main(arguments: Arguments) -> None:
             began = time.perf_counter()
             bounds = Limits(now=now, next=arcs, total=min(now + arcs, MOST_PARENTS), penalty=1.0)
             refiner = Refiner(transitions, 8, 4, bounds)
-            book = refiner.search(start)
-            for step in range(arguments.rounds):
-                noise = NOISE * max(0.0, 1.0 - step / (0.8 * arguments.rounds))
-                book, _ = refiner.refine(book, free, noise, 2, rng)
+            search = CodeSearch(refiner, questions, 8, arguments.named_factors, config.train.headline)
+            search.start(rng.normal(size=(transitions.num_views, 8, 8)), rng)
+            book = search.search(max(3, round(arguments.epochs / 6)), max(4, round(arguments.epochs / 2)), rng)
             count, _, _ = book.structure.arrays()
             seconds = time.perf_counter() - began
             print(

@@ -24,7 +24,8 @@ def readability(codes: np.ndarray, truth: np.ndarray, names: tuple[str, ...], nu
     Returns:
         `predicates`: per name `factors` (the smallest set that determines it, the first in lexical order; all N
         where none does) and `information` (normalised mutual information with the best factor), `best_factor`;
-        `mean_factors` and `mean_information` over predicates; `single`, the share that one factor determines.
+        `mean_factors` and `mean_information` over predicates; `single` and `pairs`, the shares that one factor and
+        that at most two factors determine.
     """
     assert truth.shape == (len(codes), len(names)), truth.shape
     varies = np.flatnonzero(truth.any(0) & ~truth.all(0))
@@ -49,6 +50,7 @@ def readability(codes: np.ndarray, truth: np.ndarray, names: tuple[str, ...], nu
     return {
         "mean_factors": float(counts.mean()) if len(counts) else 0.0,
         "single": float((counts == 1).mean()) if len(counts) else 1.0,
+        "pairs": float((counts <= 2).mean()) if len(counts) else 1.0,
         "mean_information": float(information.max(0).mean()) if len(counts) else 1.0,
         "predicates": report,
     }

@@ -2,9 +2,9 @@
 
 With few distinct views, the likelihood of a 2DBN whose tables are counted from the codes can be followed
 exactly while single entries of the code book change. A move gives view v the value k in factor i; its cost is
-the change of the total conditional entropy (nats times weight) plus the reluctance of the encoder to give that
-value. Codes stay distinct. Noise that fades over the rounds (simulated annealing with Gumbel noise, i.e. Gibbs
-sampling) keeps the descent out of poor minima. After every round the structure is searched anew.
+the change of the total conditional entropy (nats times weight) plus a given reluctance to give that value. Codes
+stay distinct. Noise that fades over the rounds (simulated annealing with Gumbel noise, i.e. Gibbs sampling) keeps
+the descent out of poor minima. After every round the structure is searched anew.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nesy.compiled import njit
+from nesy.world_model.counting import Counts, Edges, Families, count, edges_of, families_of, logs_up_to, shift_edge
 from nesy.world_model.distinct import Transitions
 from nesy.world_model.structure import Limits, Structure, search
 
@@ -30,120 +31,24 @@ class CodeBook:
 
 
 @njit(cache=True)
-def _xlogx(count: int, table: np.ndarray) -> float:
-    if count < len(table):
-        return table[count]
-    return count * np.log(count)
-
-
-@njit(cache=True)
-def _cell(
-    f: int,
-    source: int,
-    target: int,
-    child: int,
-    codes: np.ndarray,
-    count: np.ndarray,
-    which: np.ndarray,
-    factor: np.ndarray,
-    num_values: int,
-) -> int:
-    key = 0
-    for p in range(count[f]):
-        view = source if which[f, p] == 0 else target
-        key = key * num_values + codes[view, factor[f, p]]
-    return key * num_values + codes[target, child]
-
-
-@njit(cache=True)
-def _count(
-    codes: np.ndarray,
-    source: np.ndarray,
-    action: np.ndarray,
-    target: np.ndarray,
-    weight: np.ndarray,
-    count: np.ndarray,
-    which: np.ndarray,
-    factor: np.ndarray,
-    num_values: int,
-    cells: np.ndarray,
-    rows: np.ndarray,
-) -> None:
-    num_factors = codes.shape[1]
-    cells[:] = 0
-    rows[:] = 0
-    for e in range(len(source)):
-        for i in range(num_factors):
-            f = action[e] * num_factors + i
-            key = _cell(f, source[e], target[e], i, codes, count, which, factor, num_values)
-            cells[f, key] += weight[e]
-            rows[f, key // num_values] += weight[e]
-
-
-@njit(cache=True)
-def _shift_counts(
-    sign: int,
-    view: int,
-    changed: int,
-    codes: np.ndarray,
-    source: np.ndarray,
-    action: np.ndarray,
-    target: np.ndarray,
-    weight: np.ndarray,
-    start: np.ndarray,
-    incident: np.ndarray,
-    count: np.ndarray,
-    which: np.ndarray,
-    factor: np.ndarray,
-    as_now: np.ndarray,
-    as_next: np.ndarray,
-    num_values: int,
-    cells: np.ndarray,
-    rows: np.ndarray,
-    table: np.ndarray,
-) -> float:
+def _shift(
+    sign: int, view: int, changed: int, codes: np.ndarray, start: np.ndarray, incident: np.ndarray, edges: Edges,
+    families: Families, counts: Counts, num_values: int,
+) -> float:  # fmt: skip
     """Add (sign 1) or remove (-1) what depends on one entry of the code book; returns the change of entropy."""
-    num_factors = codes.shape[1]
     change = 0.0
     for position in range(start[view], start[view + 1]):
         e = incident[position]
-        for i in range(num_factors):
-            f = action[e] * num_factors + i
-            if not ((source[e] == view and as_now[f, changed]) or (target[e] == view and as_next[f, changed])):
-                continue
-            key = _cell(f, source[e], target[e], i, codes, count, which, factor, num_values)
-            row = key // num_values
-            before, mass = cells[f, key], rows[f, row]
-            after, new_mass = before + sign * weight[e], mass + sign * weight[e]
-            change += _xlogx(before, table) - _xlogx(after, table) + _xlogx(new_mass, table) - _xlogx(mass, table)
-            cells[f, key] = after
-            rows[f, row] = new_mass
+        before, after = edges.source[e] == view, edges.target[e] == view
+        change += shift_edge(sign, e, before, after, changed, codes, edges, families, counts, num_values)
     return change
 
 
 @njit(cache=True)
 def _sweep(
-    visit: np.ndarray,
-    noise: np.ndarray,
-    reluctance: np.ndarray,
-    taken: np.ndarray,
-    codes: np.ndarray,
-    source: np.ndarray,
-    action: np.ndarray,
-    target: np.ndarray,
-    weight: np.ndarray,
-    start: np.ndarray,
-    incident: np.ndarray,
-    count: np.ndarray,
-    which: np.ndarray,
-    factor: np.ndarray,
-    as_now: np.ndarray,
-    as_next: np.ndarray,
-    num_values: int,
-    cells: np.ndarray,
-    rows: np.ndarray,
-    table: np.ndarray,
-) -> int:
+    visit: np.ndarray, noise: np.ndarray, reluctance: np.ndarray, taken: np.ndarray, codes: np.ndarray,
+    start: np.ndarray, incident: np.ndarray, edges: Edges, families: Families, counts: Counts, num_values: int,
+) -> int:  # fmt: skip
     num_factors = codes.shape[1]
     moved = 0
     for step in range(len(visit)):
@@ -155,22 +60,19 @@ def _sweep(
         for _ in range(num_factors - 1 - i):
             place *= num_values
         rest = whole - old * place
-        common = (
-            view, i, codes, source, action, target, weight, start, incident,
-            count, which, factor, as_now, as_next, num_values, cells, rows, table,
-        )  # fmt: skip
-        _shift_counts(-1, *common)
+        common = (view, i, codes, start, incident, edges, families, counts, num_values)
+        _shift(-1, *common)
         best, best_cost = old, np.inf
         for value in range(num_values):
             if value != old and taken[rest + value * place]:
                 continue
             codes[view, i] = value
-            cost = _shift_counts(1, *common) + reluctance[view, i, value] - noise[step, value]
-            _shift_counts(-1, *common)
+            cost = _shift(1, *common) + reluctance[view, i, value] - noise[step, value]
+            _shift(-1, *common)
             if cost < best_cost:
                 best, best_cost = value, cost
         codes[view, i] = best
-        _shift_counts(1, *common)
+        _shift(1, *common)
         if best != old:
             moved += 1
             taken[whole] = False
@@ -199,8 +101,8 @@ class Refiner:
         order = np.argsort(ends, kind="stable")
         self._incident = np.concatenate([edges, edges[~loops]])[order]
         self._start = np.searchsorted(ends[order], np.arange(transitions.num_views + 1))
-        counts = np.arange(min(int(transitions.weight.sum()) + 1, 1 << 20), dtype=np.float64)
-        self._table = counts * np.log(np.maximum(counts, 1.0))
+        self.edges = edges_of(transitions)
+        self.logs = logs_up_to(int(transitions.weight.sum()))
 
     def search(self, codes: np.ndarray, start: Structure | None = None) -> CodeBook:
         """The best structure found for `codes`, keeping what is better in `start`."""
@@ -212,9 +114,15 @@ class Refiner:
         return CodeBook(codes, structure, nll)
 
     def refine(
-        self, book: CodeBook, reluctance: np.ndarray, noise: float, sweeps: int, rng: np.random.Generator
+        self,
+        book: CodeBook,
+        reluctance: np.ndarray,
+        noise: float,
+        sweeps: int,
+        rng: np.random.Generator,
+        factors: list[int],
     ) -> tuple[CodeBook, int]:
-        """Some sweeps over every entry of the code book, then a new search of the structure.
+        """Some sweeps over the entries of some factors, then a new search of the structure.
 
         Args:
             book: distinct codes and their structure.
@@ -222,37 +130,28 @@ class Refiner:
             noise: scale of the Gumbel noise (the annealing temperature), in nats.
             sweeps: passes over all entries.
             rng: draws the order and the noise.
+            factors: those whose values may change.
 
         Returns:
             The new code book and the number of entries changed.
         """
-        t = self.transitions
         codes = book.codes.copy()
         num_views, num_factors = codes.shape
-        count, which, factor = book.structure.arrays()
-        families = len(count)
-        as_now = np.zeros((families, num_factors), dtype=np.bool_)
-        as_next = np.zeros((families, num_factors), dtype=np.bool_)
-        for f in range(families):
-            as_next[f, f % num_factors] = True
-            for p in range(count[f]):
-                (as_now if which[f, p] == 0 else as_next)[f, factor[f, p]] = True
-        rows = np.zeros((families, self.num_values ** int(count.max())), dtype=np.int32)
-        cells = np.zeros((families, self.num_values ** (int(count.max()) + 1)), dtype=np.int32)
-        edges = (t.source, t.action, t.target, t.weight)
-        _count(codes, *edges, count, which, factor, self.num_values, cells, rows)
+        families = families_of(book.structure)
+        counts = count(codes, self.edges, families, self.num_values, self.logs)
         moved = 0
         place = self.num_values ** np.arange(num_factors - 1, -1, -1)
         for _ in range(sweeps):
-            visit = rng.permutation(num_views * num_factors)
-            gumbel = noise * rng.gumbel(size=(len(visit), self.num_values)) if noise > 0 else np.zeros((1, 1))
-            if noise <= 0:
-                gumbel = np.broadcast_to(gumbel, (len(visit), self.num_values)).copy()
+            entries = np.arange(num_views)[:, None] * num_factors + np.array(factors, dtype=np.int64)
+            visit = rng.permutation(entries.reshape(-1))
+            gumbel = np.zeros((len(visit), self.num_values))
+            if noise > 0:
+                gumbel = noise * rng.gumbel(size=gumbel.shape)
             taken = np.zeros(self.num_values**num_factors, dtype=np.bool_)
             taken[codes @ place] = True
             moved += _sweep(
-                visit, gumbel, reluctance, taken, codes, *edges, self._start, self._incident,
-                count, which, factor, as_now, as_next, self.num_values, cells, rows, self._table,
+                visit, gumbel, reluctance, taken, codes, self._start, self._incident,
+                self.edges, families, counts, self.num_values,
             )  # fmt: skip
         return self.search(codes, book.structure), moved
 

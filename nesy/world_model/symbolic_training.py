@@ -1,14 +1,16 @@
-"""Training of the `symbolic` architecture, in three stages.
+"""Training of the `symbolic` architecture, in four stages.
 
 1. `network`: encoder, decoder, inverse model and an autoregressive forward guide are trained together on
    `L = L_VAE + L_forward + L_inverse` with straight-through Gumbel samples of a falling temperature, less a
-   bonus for using all values.
-2. `codes` (where the distinct views are few): the codes are made distinct and refined by coordinate descent on
-   the likelihood of the 2DBN whose tables are counted from them; how sure the encoder was enters as a cost.
-3. `fit`: encoder, decoder and inverse model learn the refined code book, until every view is encoded to its code
-   and rebuilt exactly. The tables are then counted from the encoder's own codes.
+   bonus for using all values. Only maps that are not held out are learned from; the figures on held-out maps are
+   those at the end of this stage.
+2. `questions` and 3. `codes` (where the distinct views are few): a code book is searched whose named factors answer
+   questions about the view, and whose other factors make codes distinct and the next code predictable
+   (`code_search.py`).
+4. `fit`: encoder, decoder and inverse model learn the code book, until every view is encoded to its code and rebuilt
+   exactly. The tables are then counted from the encoder's own codes.
 
-Where views are many, stage 2 is left out and stage 3 goes on as stage 1 without noise.
+Where views are many, stages 2 and 3 are left out and the last stage goes on as the first without noise.
 """
 
 from __future__ import annotations
@@ -21,14 +23,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from domains.core import PredicateVocabulary
 from nesy.config import TrainConfig
 from nesy.world_model import losses
+from nesy.world_model.code_search import CodeSearch, structure_of
 from nesy.world_model.codec import SymbolicCodec
 from nesy.world_model.distinct import Transitions, view_keys
 from nesy.world_model.gates import limits, next_gates, view_gates
 from nesy.world_model.networks import SymbolicWorldModel, perceptron
-from nesy.world_model.refinement import CodeBook, Refiner, separate
-from nesy.world_model.structure import Limits, Structure
+from nesy.world_model.questions import Questions
+from nesy.world_model.refinement import Refiner
+from nesy.world_model.structure import Limits
 
 REFINE_UP_TO = 5000
 """Most distinct views for which codes are refined one by one."""
@@ -39,16 +44,10 @@ MOST_PARENTS = 5
 LEARNING_SCALE = 0.3
 """Share of the configured step size that suits plain perceptrons."""
 USAGE_WEIGHT, FORWARD_WEIGHT, INVERSE_WEIGHT = 0.02, 0.1, 0.1
-RELUCTANCE = 1.5
-"""Nats of cost per nat of the encoder's disbelief."""
-NOISE = 12.0
-"""Annealing temperature of the refinement at its start, in nats."""
-FIT_EPOCHS = 60
+FIT_EPOCHS = 120
 """Epochs that the third stage may take at least."""
 PASSES = 4
 """How often an epoch of the third stage shows every view."""
-SWEEPS = 2
-"""Passes over the code book per round of refinement."""
 
 
 class ForwardGuide(nn.Module):
@@ -77,7 +76,7 @@ class ForwardGuide(nn.Module):
 class SymbolicTrainer:
     """One training run; `tick` does one epoch or one round, and all state goes through `state` and `restore`."""
 
-    stages = ("network", "codes", "fit")
+    stages = ("network", "questions", "codes", "fit")
 
     def __init__(
         self,
@@ -86,6 +85,7 @@ class SymbolicTrainer:
         everything: Transitions,
         training: Transitions,
         held_out: Transitions | None,
+        predicates: PredicateVocabulary | None = None,
     ) -> None:
         self.config, self.everything, self.held_out = config, everything, held_out
         self.refines = everything.num_views <= REFINE_UP_TO
@@ -108,9 +108,15 @@ class SymbolicTrainer:
         )
         self.refiner = Refiner(self.final, self.model.num_values, self.model.num_actions, bounds)
         self.train_refiner = Refiner(training, self.model.num_values, self.model.num_actions, bounds)
-        self.rounds = max(4, round(config.epochs / 4)) if self.refines else 0
-        self.book: CodeBook | None = None
-        self.reluctance: np.ndarray | None = None
+        self.search: CodeSearch | None = None
+        if self.refines:
+            questions = Questions.about_cells(everything.views)
+            if predicates is not None:
+                truth = predicates.evaluate(everything.views)
+                questions = Questions.of(predicates.names, truth, config.headline)
+            self.search = CodeSearch(
+                self.refiner, questions, self.model.num_factors, config.named_factors, config.headline
+            )
         self.held_out_figures: dict[str, Any] = {}
         self.stage, self.epoch, self.finished = "network", 0, False
         self.views = torch.as_tensor(everything.views, device=self.device)
@@ -118,46 +124,56 @@ class SymbolicTrainer:
     # ---------------------------------------------------------------- progress and time
     def length(self) -> int:
         """Most ticks that the run can take."""
-        return self.config.epochs + self.rounds + self._fit_epochs()
+        return sum(self._rounds(stage) for stage in self.stages)
 
-    def _fit_epochs(self) -> int:
-        # A refined code book is learned from scratch, which takes its time however little there was before.
-        return max(self.config.epochs, FIT_EPOCHS) if self.refines else self.config.epochs
+    def _rounds(self, stage: str) -> int:
+        epochs, refines = self.config.epochs, self.refines
+        named = self.search is not None and self.search.named > 0
+        return {
+            "network": epochs,
+            "questions": max(3, round(epochs / 6)) if named else 0,
+            "codes": max(4, round(epochs / 2)) if refines else 0,
+            # A refined code book is learned from scratch, which takes its time however little there was before.
+            "fit": max(epochs, FIT_EPOCHS) if refines else epochs,
+        }[stage]
 
     def deadline(self) -> float:
         """Seconds of the time limit after which the present stage must end."""
         if not self.config.time_limit:
             return math.inf
-        share = {"network": 0.4 if self.refines else 0.7, "codes": 0.75, "fit": 0.97}[self.stage]
+        share = {"network": 0.3 if self.refines else 0.7, "questions": 0.6, "codes": 0.8, "fit": 0.97}[self.stage]
         return share * self.config.time_limit
 
     def tick(self, elapsed: float) -> dict[str, Any]:
         """Do one epoch or round; `elapsed` is the time used so far, in seconds."""
         stage = self.stage
-        figures = {"network": self._network_epoch, "codes": self._codes_round, "fit": self._fit_epoch}[stage]()
+        figures = {
+            "network": self._network_epoch,
+            "questions": self._questions_round,
+            "codes": self._codes_round,
+            "fit": self._fit_epoch,
+        }[stage]()
         self.epoch += 1
-        last = {"network": self.config.epochs, "codes": self.rounds, "fit": self._fit_epochs()}[stage]
-        if self.epoch >= last or figures.pop("converged", False) or elapsed >= self.deadline():
+        if self.epoch >= self._rounds(stage) or figures.pop("converged", False) or elapsed >= self.deadline():
             self._end_stage()
         return {"stage": stage, **figures}
 
     def _end_stage(self) -> None:
         if self.stage == "network":
             self._measure_held_out()
-            if self.refines:
-                logits = self._logits()
-                codes = separate(logits)
-                self.reluctance = RELUCTANCE * (logits.max(2, keepdims=True) - logits).clip(max=30.0)
-                self.book = self.refiner.search(codes)
+            if self.search is not None:
+                self.search.start(self._logits(), self.rng)
+        if self.stage == "questions" and self.search is not None:
+            self.search.separate()
         if self.stage == "fit":
             self._set_forward_model(self.final)
             if not self.refines:
                 self._measure_held_out()
             self.finished = True
             return
-        self.stage = self.stages[self.stages.index(self.stage) + 1]
-        if self.stage == "codes" and not self.refines:
-            self.stage = "fit"
+        self.stage = next(
+            stage for stage in self.stages[self.stages.index(self.stage) + 1 :] if self._rounds(stage) > 0
+        )
         self.epoch = 0
         self.optimizer = self._optimizer(self.config.learning_rate * LEARNING_SCALE * (1.0 if self.refines else 0.3))
 
@@ -212,21 +228,27 @@ class SymbolicTrainer:
         )
         return parts
 
-    # ---------------------------------------------------------------- stage 2
-    def _codes_round(self) -> dict[str, Any]:
-        assert self.book is not None and self.reluctance is not None
-        noise = NOISE * max(0.0, 1.0 - self.epoch / (0.8 * self.rounds))
-        self.book, moved = self.refiner.refine(self.book, self.reluctance, noise, SWEEPS, self.rng)
-        return {"next_code_nll": self.book.nll, "moved": moved, "noise": noise}
+    # ---------------------------------------------------------------- stages 2 and 3
+    def _questions_round(self) -> dict[str, Any]:
+        assert self.search is not None
+        return self.search.questions_round(self.epoch / (self._rounds("questions") - 1), self.rng)
 
-    # ---------------------------------------------------------------- stage 3
+    def _codes_round(self) -> dict[str, Any]:
+        assert self.search is not None
+        return self.search.codes_round(self.epoch / self._rounds("codes"), self.rng)
+
+    def named_factors(self) -> dict[str, Any]:
+        """The questions of the named factors and what every value answers; see `CodeSearch.meanings`."""
+        return self.search.meanings() if self.search is not None else {}
+
+    # ---------------------------------------------------------------- stage 4
     def _fit_epoch(self) -> dict[str, Any]:
-        done = self.epoch / self._fit_epochs()
-        if self.book is None:
+        done = self.epoch / self._rounds("fit")
+        if self.search is None or self.search.book is None:
             return {**self._autoencoder_epoch(0.0, 0.4, done), **self._view_figures()}
         self._set_learning_rate(done)
         t, model = self.final, self.model
-        codes = torch.as_tensor(self.book.codes, device=self.device)
+        codes = torch.as_tensor(self.search.book.codes, device=self.device)
         size = min(t.num_views, self.config.batch_size)
         steps = max(8, min(MOST_STEPS, PASSES * t.num_views // size))
         totals = {"loss": 0.0, "code": 0.0, "reconstruction": 0.0, "inverse": 0.0}
@@ -280,7 +302,8 @@ class SymbolicTrainer:
         refiner = self.refiner if t is self.final else self.train_refiner
         with torch.no_grad():
             codes = self.model.codes(self.views).cpu().numpy().astype(np.int64)
-        start = self.book.structure if self.book is not None else None
+        found = self.search.book if self.search is not None else None
+        start = found.structure if found is not None else None
         book = refiner.search(codes, start)
         self.model.set_transitions(book.structure, codes[t.source], t.action, codes[t.target], t.weight)
 
@@ -315,16 +338,9 @@ class SymbolicTrainer:
         structure = self.model.settings().get("structure")
         if structure is not None:
             value["structure"] = structure
-        if self.book is not None and self.reluctance is not None:
-            tensors["codes"] = torch.as_tensor(self.book.codes)
-            tensors["reluctance"] = torch.as_tensor(self.reluctance)
-            found = self.book.structure
-            value["book"] = {
-                "nll": self.book.nll,
-                "parents_now": found.parents_now,
-                "parents_next": found.parents_next,
-                "order": found.order,
-            }
+        if self.search is not None:
+            search_tensors, value["search"] = self.search.state()
+            tensors |= search_tensors
         return tensors, value
 
     def restore(self, tensors: dict[str, Tensor], value: dict[str, Any]) -> None:
@@ -345,18 +361,8 @@ class SymbolicTrainer:
         self.held_out_figures = value["held_out"]
         if "structure" in value:
             self.model.set_structure(structure_of(value["structure"]))
-        if "book" in value:
-            self.book = CodeBook(tensors["codes"].numpy(), structure_of(value["book"]), value["book"]["nll"])
-            self.reluctance = tensors["reluctance"].numpy()
-
-
-def structure_of(value: dict[str, Any]) -> Structure:
-    """A structure from its JSON form."""
-
-    def parents(name: str) -> tuple[tuple[tuple[int, ...], ...], ...]:
-        return tuple(tuple(tuple(int(j) for j in family) for family in action) for action in value[name])
-
-    return Structure(parents("parents_now"), parents("parents_next"), tuple(int(i) for i in value["order"]))
+        if self.search is not None:
+            self.search.restore(tensors, value["search"])
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:

@@ -93,7 +93,9 @@ def _train(
 ) -> dict[str, Any]:
     references = {} if domain is None else _references(domain, variant)
     known = [reference.views for reference in references.values()]
-    everything = with_mirror(columns.transitions(views=np.concatenate(known) if known else None))
+    everything = columns.transitions(views=np.concatenate(known) if known else None)
+    if config.mirror_images:
+        everything = with_mirror(everything)
     apart = columns.held_out(config.held_out, np.random.default_rng(seed))
     held_out = columns.transitions(apart) if apart.any() else None
     trainer: Trainer
@@ -102,8 +104,11 @@ def _train(
     else:
         training = everything
         if held_out is not None:
-            training = with_mirror(columns.transitions(~apart), views=everything.views)
-        trainer = SymbolicTrainer(config, seed, everything, training, held_out)
+            training = columns.transitions(~apart, views=everything.views)
+            if config.mirror_images:
+                training = with_mirror(training, views=everything.views)
+        predicates = domain.predicates if domain is not None else None
+        trainer = SymbolicTrainer(config, seed, everything, training, held_out, predicates)
     fingerprint = _fingerprint(config, seed, everything)
     tick, elapsed = _resume(trainer, folder / CHECKPOINT, fingerprint)
     with MetricsLog(folder, keep=tick) as log, progress.task("training the world model", trainer.length()) as bar:
@@ -132,8 +137,9 @@ def _train(
     if domain is not None:
         truth = domain.predicates.evaluate(everything.views)
         read = readability(codec.codes(everything.views), truth, domain.predicates.names, codec.num_values)
-        write_json(folder / "readability.json", read)
-        metrics["readability"] = {name: read[name] for name in ("mean_factors", "single", "mean_information")}
+        named = trainer.named_factors() if isinstance(trainer, SymbolicTrainer) else {}
+        write_json(folder / "readability.json", {**read, "named": named})
+        metrics["readability"] = {name: read[name] for name in ("mean_factors", "single", "pairs", "mean_information")}
     save_world_model(trainer.model, folder, metrics)
     return metrics
 
@@ -153,6 +159,8 @@ def _check(config: TrainConfig) -> None:
             raise UserError(f"training: {name} must be positive, not {value}")
     if not 1 <= config.max_parents <= 5:
         raise UserError(f"training: max_parents must be from 1 to 5, not {config.max_parents}")
+    if not 0 <= config.named_factors <= 8:
+        raise UserError(f"training: named_factors must be from 0 to 8, not {config.named_factors}")
     if not 0 <= config.held_out < 1:
         raise UserError(f"training: held_out must be in [0, 1), not {config.held_out}")
     try:

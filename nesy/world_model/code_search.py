@@ -1,0 +1,153 @@
+"""The code book of few distinct views: named factors first, then factors that complete the code.
+
+1. `questions`: every factor gets a group of questions (`questions.py`).
+2. `codes`: the last `named` factors keep their questions; the others, which come first in the order of slice t+1,
+   give up theirs. Their values are refined entry by entry until codes are distinct and predict the next code
+   (`refinement.py`); a value still costs what it fails to tell about the questions that its factor knows best.
+
+Without named factors the second step starts from the encoder's codes.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nesy.world_model.questions import GroupSearch, Questions, telling_cost
+from nesy.world_model.refinement import CodeBook, Refiner, separate
+from nesy.world_model.structure import Structure
+
+NOISE = 12.0
+"""Annealing temperature of the refinement at its start, in nats."""
+SWEEPS = 2
+"""Passes over the code book per round of refinement."""
+MOVES = 1500
+"""Moves tried in a round of questions."""
+HOT, COLD = 0.02, 0.001
+"""Temperatures of the questions in their first and their last but one round, nats per transition; then 0."""
+COLLISION = 1.0
+"""Price in the first step of a nat that the codes do not say about the view; completing factors add it later."""
+ADJUSTING, WARM, NEVER = 300, 0.001, 1e3
+"""Moves of the questions in a round of the second step, their temperature at its start, and what makes codes stay
+distinct."""
+MEANING = 1.0
+"""Nats of cost per nat that a value of a completing factor fails to tell about a view."""
+
+
+class CodeSearch:
+    """Both steps, round by round; all state goes through `state` and `restore`."""
+
+    def __init__(
+        self, refiner: Refiner, questions: Questions, num_factors: int, named: int, headline: tuple[str, ...]
+    ) -> None:
+        """Prepare the search.
+
+        Args:
+            refiner: of the transitions to predict.
+            questions: that can be asked.
+            num_factors: N.
+            named: how many factors keep their questions.
+            headline: questions that the first named factor asks in any case.
+        """
+        self.refiner, self.questions, self.num_factors = refiner, questions, num_factors
+        self.named = named if questions.names else 0
+        self.completing = list(range(num_factors - self.named))
+        self.asking = list(range(num_factors - self.named, num_factors))
+        fixed = {num_factors - self.named: headline} if self.named else {}
+        self._search = GroupSearch(questions, refiner, fixed)
+        self.groups: np.ndarray | None = None
+        self.book: CodeBook | None = None
+
+    def start(self, logits: np.ndarray, rng: np.random.Generator) -> None:
+        """Begin: with random questions, or from an encoder's logits [V, N, K] where no factor is to be named."""
+        if self.named:
+            self.groups, self.book = self._search.start(self.num_factors, rng)
+        else:
+            self.book = self.refiner.search(separate(logits))
+
+    def questions_round(self, done: float, rng: np.random.Generator) -> dict[str, Any]:
+        """One round of the first step; `done` is 1 in the last one."""
+        assert self.groups is not None and self.book is not None
+        temperature = HOT * (COLD / HOT) ** done if done < 1 else 0.0
+        everyone = list(range(self.num_factors))
+        self.groups, self.book, made = self._search.improve(
+            self.groups, self.book, everyone, MOVES, temperature, COLLISION, rng
+        )
+        distinct = len(np.unique(self.book.codes, axis=0))
+        return {"next_code_nll": self.book.nll, "distinct_codes": distinct, "moved": made}
+
+    def separate(self) -> None:
+        """End of the first step: make the codes distinct, by the completing factors as far as they can."""
+        assert self.book is not None
+        num_values = self.refiner.num_values
+        price = np.where(np.arange(self.num_factors) < len(self.completing), 1.0, 1e3)
+        codes = separate((self.book.codes[:, :, None] == np.arange(num_values)) * price[:, None])
+        self.book = self.refiner.search(codes, self.book.structure)
+
+    def codes_round(self, done: float, rng: np.random.Generator) -> dict[str, Any]:
+        """One round of the second step; the noise ends at 80 % of the rounds."""
+        assert self.book is not None
+        noise = NOISE * max(0.0, 1.0 - done / 0.8)
+        cost = MEANING * telling_cost(self.questions.answers, self.book.codes, self.completing, self.refiner.num_values)
+        self.book, moved = self.refiner.refine(self.book, cost, noise, SWEEPS, rng, self.completing)
+        if self.groups is not None:
+            temperature = WARM * max(0.0, 1.0 - done / 0.8)
+            self.groups, self.book, adjusted = self._search.improve(
+                self.groups, self.book, self.asking, ADJUSTING, temperature, NEVER, rng
+            )
+            moved += adjusted
+        return {"next_code_nll": self.book.nll, "moved": moved, "noise": noise}
+
+    def search(self, questions_rounds: int, codes_rounds: int, rng: np.random.Generator) -> CodeBook:
+        """Both steps after `start`, all rounds."""
+        for done in np.linspace(0.0, 1.0, questions_rounds) if self.named else ():
+            self.questions_round(float(done), rng)
+        self.separate()
+        for epoch in range(codes_rounds):
+            self.codes_round(epoch / codes_rounds, rng)
+        assert self.book is not None
+        return self.book
+
+    def meanings(self) -> dict[str, Any]:
+        """The named factors, by number: their questions and what every value answers."""
+        if self.groups is None or self.book is None:
+            return {}
+        return {str(i): self.questions.meanings(self.groups[i], self.book.codes[:, i]) for i in self.asking}
+
+    # ---------------------------------------------------------------- state
+    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Everything that the next round depends on."""
+        if self.book is None:
+            return {}, {}
+        tensors = {"codes": torch.as_tensor(self.book.codes)}
+        if self.groups is not None:
+            tensors["groups"] = torch.as_tensor(self.groups)
+        return tensors, {"book": {"nll": self.book.nll, **structure_value(self.book.structure)}}
+
+    def restore(self, tensors: dict[str, Tensor], value: dict[str, Any]) -> None:
+        """Continue from what `state` gave."""
+        if "book" in value:
+            book = value["book"]
+            self.book = CodeBook(tensors["codes"].numpy().copy(), structure_of(book), book["nll"])
+            self.groups = tensors["groups"].numpy().copy() if "groups" in tensors else None
+
+
+def structure_value(structure: Structure) -> dict[str, Any]:
+    """A structure as JSON values."""
+    return {
+        "parents_now": structure.parents_now,
+        "parents_next": structure.parents_next,
+        "order": structure.order,
+    }
+
+
+def structure_of(value: dict[str, Any]) -> Structure:
+    """A structure from its JSON values."""
+
+    def parents(name: str) -> tuple[tuple[tuple[int, ...], ...], ...]:
+        return tuple(tuple(tuple(int(j) for j in family) for family in action) for action in value[name])
+
+    return Structure(parents("parents_now"), parents("parents_next"), tuple(int(i) for i in value["order"]))
