@@ -69,7 +69,7 @@ class Planner(Protocol):
 
 
 class PlanningAgent:
-    """Keeps a particle belief per episode and plans in it with pomdp-py's POUCT or our own search.
+    """Keeps a particle belief per episode and plans in it with pomdp-py's POUCT, QMDP or our own search.
 
     Every episode has random streams of its own, so results do not depend on which episodes run side by side.
     """
@@ -117,6 +117,10 @@ class PlanningAgent:
             from planners.pomdp_py_adapter import POUCTAgent
 
             return POUCTAgent(self.model, self.compiled, self.config, rng)
+        if self.kind == "qmdp":
+            from planners.qmdp import LocalQMDP
+
+            return LocalQMDP(self.model, self.compiled, self.config, rng)
         from planners.ialm_search import IALMSearch
 
         return IALMSearch(self.model, self.compiled, self.config, rng)

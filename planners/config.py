@@ -11,7 +11,7 @@ from typing import Literal
 INFLUENCE_MODES = ("zero", "random", "egocentric", "perspective-shift", "perfect-information")
 INPUT_SETS = ("paper", "full")
 LEARNING_AGENTS = ("dqn",)
-PLANNING_AGENTS = ("pomdp", "search")
+PLANNING_AGENTS = ("pomdp", "search", "qmdp")
 ORACLES = ("optimum", "bayes-optimum", "egocentric-optimum")
 REFERENCE_AGENTS = ("greedy-follower", "greedy-last-seen", "random", *ORACLES)
 AGENTS = LEARNING_AGENTS + PLANNING_AGENTS + REFERENCE_AGENTS
@@ -152,8 +152,8 @@ class SearchConfig:
 class CompareConfig:
     """What is compared: the grid of agents x input sets x influence modes x variants x seeds."""
 
-    agents: tuple[str, ...] = AGENTS[:-2]
-    """Which agents: dqn, pomdp (pomdp-py), search, greedy-follower, greedy-last-seen, random, and the exact oracles
+    agents: tuple[str, ...] = tuple(agent for agent in AGENTS[:-2] if agent != "qmdp")
+    """Which agents: dqn, pomdp (pomdp-py), search, qmdp, greedy-follower, greedy-last-seen, random, and the exact oracles
     optimum (full state), bayes-optimum and egocentric-optimum (where the task is small enough)."""
     inputs: tuple[str, ...] = ("full",)
     """Input sets of the DQN: paper (b, b~) or full (b, b~ and the configuration)."""

@@ -4,10 +4,13 @@ import numpy as np
 import pomdp_py
 import pytest
 
+from domains.classic import tiger
 from planners import kernels
 from planners.config import SearchConfig
 from planners.ialm_search import IALMSearch
+from planners.pomdp import TabularPOMDP
 from planners.pomdp_py_adapter import LocalEnvironment, LocalState, POUCTAgent, RobotAction, RobotAgent
+from planners.qmdp import LocalQMDP, TabularQMDP
 from planners.tree import allocate, backup, backup_best, best_by_ucb, find_child
 from tests.planners.models import N, small_ialm
 
@@ -88,6 +91,21 @@ def test_the_tree_can_be_drawn() -> None:
     assert search.draw(2, "svg").count("<rect") > 4
     with pytest.raises(ValueError, match="'dot' or 'svg'"):
         search.draw(1, "png")  # type: ignore[arg-type]
+
+
+def test_qmdp_looks_one_step_ahead() -> None:
+    model = small_ialm(0)
+    compiled = kernels.compile_model(model)
+    planner = LocalQMDP(model, compiled, CONFIG, np.random.default_rng(0))
+    belief = np.tile(_beliefs(), (10, 1))
+    action, info = planner.plan(belief)
+    assert _optimum(1)[action] >= _optimum(1).max() - 0.1
+    assert max(info["values"]) == pytest.approx(_optimum(1).max(), abs=0.1)
+    assert planner.plan(belief, np.arange(4) == 3)[0] == 3
+    explicit = TabularPOMDP(**tiger())
+    best, seen = TabularQMDP(explicit).plan(explicit.start)
+    assert best == 0  # knowing costs nothing tomorrow
+    assert seen["upper"] == pytest.approx(-1 + 0.95 * 200, abs=1e-6)
 
 
 def test_terminal_states_stay_and_earn_nothing() -> None:
