@@ -10,7 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from domains.core import EMPTY, GOAL, DomainError, ViewGeometry
-from domains.person_following import episodes
+from domains.person_following import episodes, people
 from domains.person_following import rules as kernel
 from domains.person_following.random_numbers import seeded_stream
 from domains.person_following.starts import CORNER, Starts
@@ -35,6 +35,7 @@ from domains.person_following.world import (
 TASKS = ("crossing", "following")
 EXPERTS = ("goal", "follower")
 NUM_ACTIONS = 4
+_NO_GAPS = np.empty(0, np.int64)
 
 
 class Batch:
@@ -75,6 +76,12 @@ class Batch:
         self._own = np.full(self.num_envs, -1, np.int64)
         self._corner = np.full((self.num_envs, 2), CORNER, np.int64)
         self.seeded = False
+        # What only some rules ask for lies in kernels of its own.
+        following = task == "following"
+        self._several_goals = following and parameters.num_goals > 1
+        self._sees_only = following and parameters.person_knows == "seen"
+        self._goal_moves = following and parameters.goal_moves_at > 0
+        self._others = following and parameters.num_persons > 1
 
     def checked_grid(self, grid: Any) -> NDArray[np.uint8]:
         """A map given by the caller, as the kernel wants it.
@@ -141,28 +148,47 @@ class Batch:
             self.world.grid[:] = grid
         else:
             episodes.choose_batch(self.rules, self.world, self.maps, everywhere)
-        self._begin_where(everywhere)
-        if self.task == "following":
-            kernel.measure_batch(self.world, self.store, self.last.distance)
-        else:
-            self.last.distance[:] = 0
+        self.last.distance[:] = 0
+        self._begin_where(everywhere, self.last.distance)
         if waiting is not None:
             self.world.person[:, WAITING] = waiting
 
-    def _begin_where(self, chosen: NDArray[np.bool_]) -> None:
-        """Begin episodes on the maps that lie in the grids."""
+    def _begin_where(self, chosen: NDArray[np.bool_], gaps: NDArray[np.int64] = _NO_GAPS) -> None:
+        """Begin episodes on the maps that lie in the grids; `gaps` [B], if given, gets the distances."""
         starts = self._corner
         if self.parameters.person_start != "corner" and self.task == "following":
             starts = self._corner.copy()
             starts[chosen] = self.starts.of(self.world.grid[chosen])
-        episodes.begin_batch(self.rules, self.world, self.store, chosen, starts, self._own, self.last)
+        self._begin_at(starts, self._own, chosen, gaps)
+
+    def _begin_at(
+        self,
+        starts: NDArray[np.int64],
+        own: NDArray[np.int64],
+        chosen: NDArray[np.bool_],
+        gaps: NDArray[np.int64] = _NO_GAPS,
+    ) -> None:
+        rules, world = self.rules, self.world
+        if self._several_goals:
+            episodes.place_goals(rules, world, self.store, chosen, starts)
+        episodes.begin_batch(rules, world, self.store, chosen, starts, own, self.last, gaps)
+        if self._others:
+            people.place_others(world, chosen)
+        if self._sees_only:
+            people.begin_to_think(rules, world, self.store, chosen)
 
     def step(self, actions: NDArray[np.int64], autoreset: bool, reuse: bool = False) -> None:
         """Take a step everywhere; the results lie in `last`, whose arrays are new unless they may be reused."""
         if not reuse:
             self.last = allocate_results(self.num_envs, self.parameters.view_size)
         last = self.last
+        if self._goal_moves:
+            people.move_goals(self.rules, self.world)
         ended = kernel.step_batch(self.rules, self.world, self.store, actions, last)
+        if self._sees_only or self._goal_moves:
+            people.think_batch(self.rules, self.world, self.store)
+        if self._others:
+            people.move_others(self.world, self.store)
         if autoreset and ended:
             last.robot_view[:] = last.final_view
             last.configuration[:] = last.final_configuration
@@ -183,7 +209,7 @@ class Batch:
         everywhere = np.ones(self.num_envs, np.bool_)
         self.world.stream[:] = seeded_stream(0)
         own = np.zeros(self.num_envs, np.int64)
-        episodes.begin_batch(self.rules, self.world, self.store, everywhere, starts, own, self.last)
+        self._begin_at(starts, own, everywhere)
         won, running = np.zeros(self.num_envs, np.bool_), everywhere.copy()
         for _ in range(self.parameters.max_steps):
             self.step(self.expert("follower"), False)

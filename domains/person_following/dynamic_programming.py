@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from domains.core import FORWARD, STAY
 from domains.person_following.compiled import entry, inner
-from domains.person_following.paths import step_x, step_y
+from domains.person_following.paths import STEPS
 from domains.person_following.person_chain import PersonChain
 from domains.person_following.variants import (
     R_GOAL_PATIENCE,
@@ -50,7 +50,7 @@ def step_tables(chain: PersonChain, parameters: Parameters) -> StepTables:
     """The tables of one map under some parameters."""
     people, poses = chain.person, chain.poses
     x, y, h = poses[:, 0], poses[:, 1], poses[:, 2]
-    ahead = np.array([(step_x(k), step_y(k)) for k in range(4)])
+    ahead = np.array(STEPS)
     front_x, front_y = x + ahead[h, 0], y + ahead[h, 1]
     far = chain.distance > parameters.follow_distance
     same = (people[:, None, 0] == x) & (people[:, None, 1] == y)

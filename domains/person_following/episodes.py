@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from domains.core import EMPTY, GOAL, WALL
 from domains.person_following.compiled import entry, inner
-from domains.person_following.map_generation import generate_crossing
-from domains.person_following.people import learn, place_others, plan_route
+from domains.person_following.map_generation import draw_crossing
+from domains.person_following.people import plan_route
 from domains.person_following.random_numbers import draw_below
-from domains.person_following.store import enter_map, map_hash
+from domains.person_following.rules import measure
+from domains.person_following.store import enter_map, hash_of_map
 from domains.person_following.variants import (
     DRAWN,
     GENERATED,
@@ -16,7 +19,6 @@ from domains.person_following.variants import (
     R_MAP_SOURCE,
     R_NUM_CROSSINGS,
     R_NUM_GOALS,
-    R_PERSON_SEES_ONLY,
     R_SEE_THROUGH,
 )
 from domains.person_following.views import configuration_of, look, relative
@@ -53,7 +55,7 @@ def choose_batch(rules, world, maps, chosen):  # type: ignore[no-untyped-def]
         if not chosen[b]:
             continue
         if source == GENERATED:
-            generate_crossing(world.stream, grid, b, rules[R_NUM_CROSSINGS])
+            draw_crossing(world.stream, grid, b, rules[R_NUM_CROSSINGS])
         else:
             if source == DRAWN:
                 m = draw_below(world.stream, b, maps.shape[0])
@@ -65,23 +67,51 @@ def choose_batch(rules, world, maps, chosen):  # type: ignore[no-untyped-def]
         robot[b, EPISODE] += 1
 
 
-@inner
-def _place_goals(rules, world, store, b, start_x, start_y):  # type: ignore[no-untyped-def]
-    """List the candidate goals of map b; where it has too few, add the reachable free cells farthest off.
+@entry
+def place_goals(rules, world, store, chosen, starts):  # type: ignore[no-untyped-def]
+    """List the candidate goals of the maps where `chosen` [B], persons at `starts` [B, 2].
 
-    Each added cell is the one whose distance, in cells, to the start and to all candidates so far is
-    greatest; the first in map order among equals. So a map has always the same candidates.
+    Where a map has too few, the reachable free cells farthest off are added: each is the one whose distance, in
+    cells, to the start and to all candidates so far is greatest; the first in map order among equals. So a map has
+    always the same candidates.
     """
+    for b in range(chosen.shape[0]):
+        if chosen[b]:
+            world.grid[b, starts[b, 0], starts[b, 1]] = EMPTY
+            _list_goals(world, b)
+            _add_goals(rules, world, store, b, starts[b, 0], starts[b, 1])
+
+
+@inner
+def _list_goals(world, b):  # type: ignore[no-untyped-def]
+    """List the goal cells of map b in map order; unused places hold (0, 0)."""
     grid, goals = world.grid, world.goals
     size = grid.shape[1]
+    for k in range(goals.shape[1]):
+        goals[b, k, 0], goals[b, k, 1] = 0, 0
     count = 0
     for x in range(size):
         for y in range(size):
             if grid[b, x, y] == GOAL and count < goals.shape[1]:
                 goals[b, count, 0], goals[b, count, 1] = x, y
                 count += 1
+
+
+@inner
+def _count_goals(world, b):  # type: ignore[no-untyped-def]
+    count = 0
+    while count < world.goals.shape[1] and world.goals[b, count, 0] > 0:
+        count += 1
+    return count
+
+
+@inner
+def _add_goals(rules, world, store, b, start_x, start_y):  # type: ignore[no-untyped-def]
+    grid, goals = world.grid, world.goals
+    size = grid.shape[1]
+    count = _count_goals(world, b)
     if count >= rules[R_NUM_GOALS]:
-        return count
+        return
     # `cost` gathers the distance of each cell to the nearest of start and candidates.
     cost, queue, field = store.scratch.cost, store.scratch.heap, store.scratch.came_from
     cells = size * size
@@ -120,7 +150,7 @@ def _place_goals(rules, world, store, b, start_x, start_y):  # type: ignore[no-u
                 best, chosen = cost[cell], cell
         if source == count:
             if count >= rules[R_NUM_GOALS] or chosen < 0:
-                return count
+                return
             goals[b, count, 0], goals[b, count, 1] = chosen // size, chosen % size
             grid[b, chosen // size, chosen % size] = GOAL
             count += 1
@@ -140,29 +170,21 @@ def _begin(rules, world, store, b, x, y, own):  # type: ignore[no-untyped-def]
     if rules[R_FOLLOWING]:
         # The person replaces whatever stood on its cell, and leaves it empty.
         grid[b, x, y] = EMPTY
-    count = _place_goals(rules, world, store, b, x, y)
+    if rules[R_NUM_GOALS] == 1:
+        _list_goals(world, b)
     if own < 0:
-        own = draw_below(world.stream, b, count)
+        own = draw_below(world.stream, b, _count_goals(world, b))
     person[b, OWN], person[b, MOVES] = own, 0
     goal_x, goal_y = world.goals[b, own, 0], world.goals[b, own, 1]
     person[b, GOAL_X], person[b, GOAL_Y] = goal_x, goal_y
     person[b, BELIEVED_X], person[b, BELIEVED_Y] = goal_x, goal_y
-    world.map_id[b] = map_hash(grid, b)
-    slot = enter_map(store, grid, b, world.map_id[b], x, y, 0, goal_x, goal_y)
+    world.map_id[b] = hash_of_map(grid, b)
+    slot = enter_map(store, grid, b, world.map_id[b], x, y, np.int64(0), goal_x, goal_y)
     robot[b, SLOT] = slot
     person[b, PLAN_AT], person[b, PLAN_LENGTH] = 0, 0
     if not rules[R_FOLLOWING]:
         return
-    place_others(world, b)
-    if rules[R_PERSON_SEES_ONLY]:
-        size = grid.shape[1]
-        for cx in range(size):
-            for cy in range(size):
-                border = cx == 0 or cy == 0 or cx == size - 1 or cy == size - 1
-                world.known[b, cx, cy] = WALL if border else EMPTY
-        learn(rules, world, b)
-        plan_route(rules, world, store, b)
-    elif slot >= 0:
+    if slot >= 0:
         person[b, PLAN_LENGTH] = store.plan_length[slot]
         for i in range(store.plan_length[slot]):
             plan[b, i] = store.plan[slot, i]
@@ -171,10 +193,11 @@ def _begin(rules, world, store, b, x, y, own):  # type: ignore[no-untyped-def]
 
 
 @entry
-def begin_batch(rules, world, store, chosen, starts, own, out):  # type: ignore[no-untyped-def]
+def begin_batch(rules, world, store, chosen, starts, own, out, gaps):  # type: ignore[no-untyped-def]
     """Begin episodes where `chosen` [B], persons at `starts` [B, 2], on the maps that lie in the grids.
 
-    `own` [B] says which candidate is the person's goal; where it is negative, that is drawn.
+    `own` [B] says which candidate is the person's goal; where it is negative, that is drawn. Where there are several
+    candidates, `place_goals` comes first. `gaps` [B] gets the distances of all; [0] where they are not wanted.
     """
     grid, robot, person = world.grid, world.robot, world.person
     see_through = rules[R_SEE_THROUGH] != 0
@@ -188,3 +211,5 @@ def begin_batch(rules, world, store, chosen, starts, own, out):  # type: ignore[
         if rules[R_FOLLOWING]:
             side, ahead, heading = relative(1, 1, 0, person[b, X], person[b, Y], person[b, HEADING])
             configurations[b] = configuration_of(views, b, side, ahead, heading, see_through)
+    if gaps.shape[0] > 0 and rules[R_FOLLOWING]:
+        measure(store, grid, robot, person, gaps)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from domains.core import EMPTY, FORWARD, LEFT, RIGHT, STAY, UNSEEN, WALL, ViewGeometry
-from domains.person_following.paths import allocate_scratch, astar
+from domains.person_following.paths import allocate_scratch, find_path
 from domains.person_following.variants import Parameters
 
 _REACH = 10  # cells around the robot that its path search considers
@@ -100,7 +100,7 @@ class LastSeenFollower:
         side, ahead, heading = (int(v) for v in pose)
         x = min(max(_REACH + side, 0), 2 * _REACH)
         y = min(max(_REACH - ahead, 0), 2 * _REACH)
-        length = astar(grid, 0, _REACH, _REACH, 3, x, y, heading, True, self._scratch)
+        length = find_path(grid, 0, _REACH, _REACH, 3, x, y, heading, True, self._scratch)
         if length > 0:
             return int(self._scratch.path[0])
         if seen:

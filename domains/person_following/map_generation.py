@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from domains.core import EMPTY, GOAL, WALL
-from domains.person_following.compiled import entry
+from domains.person_following.compiled import entry, inner
 from domains.person_following.random_numbers import draw_below, shuffle
 
 MAX_SIZE = 31
 _MAX_RIVERS = MAX_SIZE
 
 
-@entry
-def generate_crossing(streams, grids, b, num_crossings):  # type: ignore[no-untyped-def]
+@inner
+def draw_crossing(streams, grids, b, num_crossings):  # type: ignore[no-untyped-def]
     """Fill `grids[b]` with a new crossing map; the goal is at (size-2, size-2).
 
     The order of the draws is Minigrid's: shuffle the rivers (vertical ones first), shuffle the directions of
@@ -49,10 +49,10 @@ def generate_crossing(streams, grids, b, num_crossings):  # type: ignore[no-unty
             if vertical[k] or horizontal[m]:
                 grids[b, k, m] = WALL
 
-    # True: a step through a vertical river, to the next room on the right.
-    path = np.zeros(_MAX_RIVERS, np.bool_)
+    # 1: a step through a vertical river, to the next room on the right.
+    path = np.zeros(_MAX_RIVERS, np.int64)
     for k in range(num_vertical):
-        path[k] = True
+        path[k] = 1
     shuffle(streams, b, path, num_crossings)
     left, top = 0, 0
     for k in range(num_crossings):
@@ -67,3 +67,9 @@ def generate_crossing(streams, grids, b, num_crossings):  # type: ignore[no-unty
         else:
             grids[b, left + 1 + draw_below(streams, b, right - left - 1), bottom] = EMPTY
             top = bottom
+
+
+@entry
+def generate_crossing(streams, grids, b, num_crossings):  # type: ignore[no-untyped-def]
+    """`draw_crossing` for callers in Python."""
+    draw_crossing(streams, grids, b, num_crossings)

@@ -44,13 +44,17 @@ def allocate_scratch(size: int) -> Scratch:
     )
 
 
-@entry
+STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
+"""Change of (x, y) by one step forward, by heading."""
+
+
+@inner
 def step_x(heading):  # type: ignore[no-untyped-def]
     """Change of x by one step forward."""
     return 1 if heading == 0 else (-1 if heading == 2 else 0)
 
 
-@entry
+@inner
 def step_y(heading):  # type: ignore[no-untyped-def]
     """Change of y by one step forward."""
     return 1 if heading == 1 else (-1 if heading == 3 else 0)
@@ -90,7 +94,7 @@ def _pop(heap, count):  # type: ignore[no-untyped-def]
     return top, count
 
 
-@entry
+@inner
 def astar(grids, b, x, y, heading, goal_x, goal_y, goal_heading, compare, scratch):  # type: ignore[no-untyped-def]
     """A* from a pose to a cell; the actions go to `scratch.path`.
 
@@ -120,7 +124,7 @@ def astar(grids, b, x, y, heading, goal_x, goal_y, goal_heading, compare, scratc
     came_from[start] = -1
     # Priorities are doubled, so that half steps of the heuristic stay whole; a key orders by
     # (priority, x, y, heading), which is the order in which the original's heap compares its entries.
-    count = _push(heap, 0, np.int64(((0 * 64 + x) * 64 + y) * 4 + heading))
+    count = _push(heap, np.int64(0), np.int64(((0 * 64 + x) * 64 + y) * 4 + heading))
     while count > 0:
         key, count = _pop(heap, count)
         h = key & 3
@@ -158,6 +162,18 @@ def astar(grids, b, x, y, heading, goal_x, goal_y, goal_heading, compare, scratc
                 priority += min(turn, 4 - turn)
             count = _push(heap, count, np.int64(((priority * 64 + nx) * 64 + ny) * 4 + nh))
     return NO_PATH
+
+
+@inner
+def way_to_cell(grids, b, x, y, heading, goal_x, goal_y, scratch):  # type: ignore[no-untyped-def]
+    """`astar` to a cell, in whatever heading; returns the number of actions."""
+    return astar(grids, b, x, y, heading, goal_x, goal_y, np.int64(-1), np.bool_(False), scratch)
+
+
+@entry
+def find_path(grids, b, x, y, heading, goal_x, goal_y, goal_heading, compare, scratch):  # type: ignore[no-untyped-def]
+    """`astar` for callers in Python."""
+    return astar(grids, b, x, y, heading, goal_x, goal_y, goal_heading, compare, scratch)
 
 
 @inner

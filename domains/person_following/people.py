@@ -1,14 +1,17 @@
 """What the persons do: plans, what they see and believe, moves; and the others who only stand in the way.
 
-The first person follows an open-loop plan to where it BELIEVES its goal to be. It makes a new one where the
-plan is used up, where its view shows a wall on it, and where its view shows that the goal is not there.
+The first person follows an open-loop plan to where it BELIEVES its goal to be. It makes a new one where its view
+shows a wall on the plan, and where its view shows that the goal is not there. Minds, moving goals and other persons
+are kernels of their own, which are compiled only where the rules ask for them.
 """
 
 from __future__ import annotations
 
+import numpy as np
+
 from domains.core import EMPTY, FORWARD, GOAL, LEFT, RIGHT, STAY, UNSEEN, WALL
-from domains.person_following.compiled import inner
-from domains.person_following.paths import astar, step_x, step_y
+from domains.person_following.compiled import entry, inner
+from domains.person_following.paths import step_x, step_y, way_to_cell
 from domains.person_following.random_numbers import draw_below
 from domains.person_following.variants import (
     R_FOLLOW_DISTANCE,
@@ -40,22 +43,15 @@ from domains.person_following.world import (
 
 @inner
 def plan_route(rules, world, store, b):  # type: ignore[no-untyped-def]
-    """Make person b a new plan to its believed goal; at it, to turn about twice, or none to stand still."""
+    """Make person b a new plan to where it believes its goal to be; none where it is there, or sees no way."""
     person, plan = world.person, world.plan
     x, y, heading = person[b, X], person[b, Y], person[b, HEADING]
     goal_x, goal_y = person[b, BELIEVED_X], person[b, BELIEVED_Y]
     grids = world.known if rules[R_PERSON_SEES_ONLY] else world.grid
-    length = astar(grids, b, x, y, heading, goal_x, goal_y, -1, False, store.scratch)
-    path = store.scratch.path
-    if length > 0:
-        for i in range(length):
-            plan[b, i] = path[i]
-    elif rules[R_TURNS_AT_GOAL]:
-        length = 2
-        turn = LEFT if draw_below(world.stream, b, 2) == 0 else RIGHT
-        plan[b, 0] = turn
-        plan[b, 1] = turn
-    person[b, PLAN_AT], person[b, PLAN_LENGTH] = 0, max(length, 0)
+    length = max(way_to_cell(grids, b, x, y, heading, goal_x, goal_y, store.scratch), 0)
+    for i in range(length):
+        plan[b, i] = store.scratch.path[i]
+    person[b, PLAN_AT], person[b, PLAN_LENGTH] = 0, length
 
 
 @inner
@@ -71,11 +67,12 @@ def _sees(sight, b, dx, dy, heading):  # type: ignore[no-untyped-def]
 
 
 @inner
-def learn(rules, world, b):  # type: ignore[no-untyped-def]
-    """Person b looks: it keeps what it sees, and drops a plan or a belief that its view contradicts."""
+def _learn(rules, world, store, b):  # type: ignore[no-untyped-def]
+    """Person b looks: it keeps what it sees, and plans anew where its view contradicts its plan or its belief."""
     grid, person, sight, known = world.grid, world.person, world.sight, world.known
     x, y, heading = person[b, X], person[b, Y], person[b, HEADING]
     look(grid, b, x, y, heading, rules[R_SEE_THROUGH] != 0, sight, b)
+    stale = False
     if rules[R_PERSON_SEES_ONLY]:
         width = sight.shape[1]
         half = width // 2
@@ -90,15 +87,16 @@ def learn(rules, world, b):  # type: ignore[no-untyped-def]
                 if inside and sight[b, vx, vy] != UNSEEN and known[b, cx, cy] != grid[b, cx, cy]:
                     known[b, cx, cy] = grid[b, cx, cy]
                     walled = walled or grid[b, cx, cy] == WALL
-        if walled and _plan_is_blocked(world, b):
-            person[b, PLAN_AT], person[b, PLAN_LENGTH] = 0, 0
+        stale = walled and _plan_is_blocked(world, b)
     if rules[R_GOAL_MOVES_AT]:
         goal_x, goal_y = person[b, BELIEVED_X], person[b, BELIEVED_Y]
         there = goal_x == x and goal_y == y
         shown = EMPTY if there else _sees(sight, b, goal_x - x, goal_y - y, heading)
         if shown != UNSEEN and grid[b, goal_x, goal_y] != GOAL:
             person[b, BELIEVED_X], person[b, BELIEVED_Y] = person[b, GOAL_X], person[b, GOAL_Y]
-            person[b, PLAN_AT], person[b, PLAN_LENGTH] = 0, 0
+            stale = True
+    if stale or person[b, PLAN_AT] >= person[b, PLAN_LENGTH]:
+        plan_route(rules, world, store, b)
 
 
 @inner
@@ -118,7 +116,7 @@ def _plan_is_blocked(world, b):  # type: ignore[no-untyped-def]
     return False
 
 
-@inner
+@entry
 def move_goals(rules, world):  # type: ignore[no-untyped-def]
     """Move each person's goal to the next candidate at its time, unless the person sees the old place."""
     grid, person, goals, sight = world.grid, world.person, world.goals, world.sight
@@ -141,11 +139,13 @@ def move_goals(rules, world):  # type: ignore[no-untyped-def]
 
 
 @inner
-def move_persons(rules, world, store, configurations, gaps):  # type: ignore[no-untyped-def]
-    """The persons' part of a step; what they do is kept as LAST_ACTION."""
+def move_persons(rules, world, configurations, gaps):  # type: ignore[no-untyped-def]
+    """The persons' part of a step; what they do is kept as LAST_ACTION.
+
+    Whoever has used up its plan is at its goal, and turns about twice, or stands still.
+    """
     robot, person, plan = world.robot, world.person, world.plan
     rest, look_back, limit = rules[R_PERSON_REST], rules[R_LOOK_BACK] != 0, rules[R_FOLLOW_DISTANCE]
-    looks = rules[R_PERSON_SEES_ONLY] != 0 or rules[R_GOAL_MOVES_AT] > 0
     for b in range(gaps.shape[0]):
         person[b, LAST_ACTION] = STAY
         if rest > 0 and robot[b, TIME] % rest == 0:
@@ -156,9 +156,11 @@ def move_persons(rules, world, store, configurations, gaps):  # type: ignore[no-
                 continue
         person[b, WAITING] = 0
         if person[b, PLAN_AT] >= person[b, PLAN_LENGTH]:
-            plan_route(rules, world, store, b)
-            if person[b, PLAN_LENGTH] == 0:
+            if rules[R_TURNS_AT_GOAL] == 0:
                 continue
+            turn = LEFT if draw_below(world.stream, b, np.int64(2)) == 0 else RIGHT
+            plan[b, 0], plan[b, 1] = turn, turn
+            person[b, PLAN_AT], person[b, PLAN_LENGTH] = 0, 2
         action = plan[b, person[b, PLAN_AT]]
         person[b, PLAN_AT] += 1
         person[b, MOVES] += 1
@@ -171,18 +173,42 @@ def move_persons(rules, world, store, configurations, gaps):  # type: ignore[no-
         else:
             person[b, X] += step_x(heading)
             person[b, Y] += step_y(heading)
-        if looks:
-            learn(rules, world, b)
 
 
-@inner
-def place_others(world, b):  # type: ignore[no-untyped-def]
-    """Put the other persons of environment b on random free cells, without plans."""
+@entry
+def think_batch(rules, world, store):  # type: ignore[no-untyped-def]
+    """Every person that has moved looks, learns, and plans anew where that is needed."""
+    person = world.person
+    for b in range(person.shape[0]):
+        if person[b, LAST_ACTION] != STAY:
+            _learn(rules, world, store, b)
+
+
+@entry
+def begin_to_think(rules, world, store, chosen):  # type: ignore[no-untyped-def]
+    """Persons of new episodes, where `chosen` [B], know the border of the map and what they see, and plan with it."""
+    size = world.known.shape[1]
+    for b in range(chosen.shape[0]):
+        if chosen[b]:
+            for x in range(size):
+                for y in range(size):
+                    border = x == 0 or y == 0 or x == size - 1 or y == size - 1
+                    world.known[b, x, y] = WALL if border else EMPTY
+            world.person[b, PLAN_AT], world.person[b, PLAN_LENGTH] = 0, 0
+            _learn(rules, world, store, b)
+
+
+@entry
+def place_others(world, chosen):  # type: ignore[no-untyped-def]
+    """Put the other persons of new episodes, where `chosen` [B], on random free cells, without plans."""
     others = world.others
-    for k in range(others.shape[1]):
-        x, y = _free_cell(world, b)
-        others[b, k, X], others[b, k, Y], others[b, k, HEADING] = x, y, draw_below(world.stream, b, 4)
-        others[b, k, PLAN_AT], others[b, k, PLAN_LENGTH] = 0, 0
+    for b in range(chosen.shape[0]):
+        if chosen[b]:
+            for k in range(others.shape[1]):
+                x, y = _free_cell(world, b)
+                others[b, k, X], others[b, k, Y] = x, y
+                others[b, k, HEADING] = draw_below(world.stream, b, np.int64(4))
+                others[b, k, PLAN_AT], others[b, k, PLAN_LENGTH] = 0, 0
 
 
 @inner
@@ -196,7 +222,7 @@ def _free_cell(world, b):  # type: ignore[no-untyped-def]
             return x, y
 
 
-@inner
+@entry
 def move_others(world, store):  # type: ignore[no-untyped-def]
     """The other persons walk shortest paths from one random free cell to the next; the robot gives way."""
     grid, robot, others, plan = world.grid, world.robot, world.others, world.other_plan
@@ -205,7 +231,7 @@ def move_others(world, store):  # type: ignore[no-untyped-def]
             x, y, heading = others[b, k, X], others[b, k, Y], others[b, k, HEADING]
             if others[b, k, PLAN_AT] >= others[b, k, PLAN_LENGTH]:
                 to_x, to_y = _free_cell(world, b)
-                length = astar(grid, b, x, y, heading, to_x, to_y, -1, False, store.scratch)
+                length = way_to_cell(grid, b, x, y, heading, to_x, to_y, store.scratch)
                 others[b, k, PLAN_AT], others[b, k, PLAN_LENGTH] = 0, max(length, 0)
                 for i in range(length):
                     plan[b, k, i] = store.scratch.path[i]

@@ -16,12 +16,11 @@ from __future__ import annotations
 from domains.core import FORWARD, LEFT, RIGHT, STAY, WALL
 from domains.person_following.compiled import entry, inner
 from domains.person_following.paths import HEADING_ALWAYS, HEADING_NEVER, step_x, step_y
-from domains.person_following.people import move_goals, move_others, move_persons
+from domains.person_following.people import move_persons
 from domains.person_following.store import distance, first_action, first_action_to_goal
 from domains.person_following.variants import (
     R_FOLLOW_DISTANCE,
     R_FOLLOWING,
-    R_GOAL_MOVES_AT,
     R_GOAL_PATIENCE,
     R_LOOK_BACK,
     R_MAX_LOST,
@@ -119,7 +118,7 @@ def _gap(store, grid, robot, person, b):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _measure(store, grid, robot, person, gaps):  # type: ignore[no-untyped-def]
+def measure(store, grid, robot, person, gaps):  # type: ignore[no-untyped-def]
     """Fill `gaps` with the robots' distances to the persons; 0 where no path exists."""
     row_of, table, visits = store.row_of, store.distance, store.visits
     rule = store.heading_rule[0]
@@ -206,34 +205,24 @@ def _judge_crossing(rules, robot, out):  # type: ignore[no-untyped-def]
 
 
 @entry
-def measure_batch(world, store, gaps):  # type: ignore[no-untyped-def]
-    """Distances [B] from the robots to the persons in the present states."""
-    _measure(store, world.grid, world.robot, world.person, gaps)
-
-
-@entry
 def step_batch(rules, world, store, actions, out):  # type: ignore[no-untyped-def]
     """Take one action per environment; returns how many episodes ended, marked in `out.ended`."""
     grid, robot, person = world.grid, world.robot, world.person
     see_through = rules[R_SEE_THROUGH] != 0
     views, configurations = out.final_view, out.final_configuration
-    if rules[R_GOAL_MOVES_AT]:
-        move_goals(rules, world)
     _move_robots(rules, world, actions, out)
     _look(see_through, grid, robot, views)
     if rules[R_FOLLOWING]:
         if rules[R_LOOK_BACK]:
             _configure(see_through, robot, person, views, configurations)
-            _measure(store, grid, robot, person, out.distance)
-        move_persons(rules, world, store, configurations, out.distance)
-        if world.others.shape[1] > 0:
-            move_others(world, store)
+            measure(store, grid, robot, person, out.distance)
+        move_persons(rules, world, configurations, out.distance)
         _configure(see_through, robot, person, views, configurations)
         for b in range(actions.shape[0]):
             remove_person(views, b, configurations[b])
-        _measure(store, grid, robot, person, out.distance)
+        measure(store, grid, robot, person, out.distance)
         _judge(rules, robot, person, out)
-        describe_batch(rules, world, out.final_person_view, out.final_pose, out.final_counters)
+        _describe(rules, world, out.final_person_view, out.final_pose, out.final_counters)
     else:
         _judge_crossing(rules, robot, out)
     count = 0
@@ -244,8 +233,8 @@ def step_batch(rules, world, store, actions, out):  # type: ignore[no-untyped-de
     return count
 
 
-@entry
-def describe_batch(rules, world, views, poses, counters):  # type: ignore[no-untyped-def]
+@inner
+def _describe(rules, world, views, poses, counters):  # type: ignore[no-untyped-def]
     """Fill the persons' views [B, v, v] and poses [B, 3] relative to the robots, and the counters [B, 2]."""
     robot, person = world.robot, world.person
     _look(rules[R_SEE_THROUGH] != 0, world.grid, person, views)
@@ -255,6 +244,12 @@ def describe_batch(rules, world, views, poses, counters):  # type: ignore[no-unt
         )
         poses[b, 0], poses[b, 1], poses[b, 2] = side, ahead, heading
         counters[b, 0], counters[b, 1] = person[b, WAITING], robot[b, LOST]
+
+
+@entry
+def describe_batch(rules, world, views, poses, counters):  # type: ignore[no-untyped-def]
+    """`_describe` for callers in Python."""
+    _describe(rules, world, views, poses, counters)
 
 
 @entry

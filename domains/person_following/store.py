@@ -24,6 +24,7 @@ from domains.person_following.paths import (
     allocate_scratch,
     astar,
     distance_field,
+    way_to_cell,
 )
 
 MAPS_USED, ROWS_USED = 0, 1
@@ -79,8 +80,8 @@ def shared_store(size: int, heading_rule: int) -> Store:
     )
 
 
-@entry
-def map_hash(grids, b):  # type: ignore[no-untyped-def]
+@inner
+def hash_of_map(grids, b):  # type: ignore[no-untyped-def]
     """A stable hash of a grid: 64-bit FNV-1a over its bytes in C order, without the sign bit."""
     value = np.uint64(0xCBF29CE484222325)
     size = grids.shape[1]
@@ -88,6 +89,12 @@ def map_hash(grids, b):  # type: ignore[no-untyped-def]
         for y in range(size):
             value = (value ^ np.uint64(grids[b, x, y])) * np.uint64(0x100000001B3)
     return np.int64(value & np.uint64(0x7FFFFFFFFFFFFFFF))
+
+
+@entry
+def map_hash(grids, b):  # type: ignore[no-untyped-def]
+    """`hash_of_map` for callers in Python."""
+    return hash_of_map(grids, b)
 
 
 @inner
@@ -122,9 +129,9 @@ def enter_map(store, grids, b, grid_hash, x, y, heading, goal_x, goal_y):  # typ
                     store.goal_first[slot, pose] = -1
             return slot
         bucket = (bucket + 1) & mask
-    slot = np.int32(store.used[MAPS_USED])
+    slot = store.used[MAPS_USED]
     if slot >= keys.shape[0]:
-        return np.int32(-1)
+        return np.int64(-1)
     store.used[MAPS_USED] += 1
     store.buckets[bucket] = slot
     for cx in range(size):
@@ -132,7 +139,7 @@ def enter_map(store, grids, b, grid_hash, x, y, heading, goal_x, goal_y):  # typ
             keys[slot, cx * size + cy] = grids[b, cx, cy]
     for i in range(5):
         keys[slot, size * size + i] = extra[i]
-    length = max(astar(grids, b, x, y, heading, goal_x, goal_y, -1, False, store.scratch), 0)
+    length = max(way_to_cell(grids, b, x, y, heading, goal_x, goal_y, store.scratch), 0)
     for i in range(length):
         store.plan[slot, i] = store.scratch.path[i]
     store.plan_length[slot] = length
@@ -158,7 +165,7 @@ def _row(store, grids, b, slot, x, y, heading):  # type: ignore[no-untyped-def]
     if row < 0 and store.used[ROWS_USED] < store.distance.shape[0]:
         row = np.int32(store.used[ROWS_USED])
         store.used[ROWS_USED] += 1
-        distance_field(grids, b, x, y, heading, compare, -1, store.distance[row], store.scratch)
+        distance_field(grids, b, x, y, heading, compare, np.int64(-1), store.distance[row], store.scratch)
         for pose in range(store.first.shape[1]):
             store.first[row, pose] = -1
         store.row_of[slot, target] = row
@@ -186,7 +193,7 @@ def first_action(store, grids, b, slot, x, y, heading, to_x, to_y, to_heading): 
     if row >= 0 and store.first[row, pose] >= 0:
         return np.int64(store.first[row, pose])
     compare = _compared(store, to_heading)
-    heuristic_heading = -1 if store.heading_rule[0] == HEADING_NEVER else to_heading
+    heuristic_heading = np.int64(-1) if store.heading_rule[0] == HEADING_NEVER else to_heading
     length = astar(grids, b, x, y, heading, to_x, to_y, heuristic_heading, compare, store.scratch)
     action = np.int64(store.scratch.path[0]) if length > 0 else np.int64(STAY)
     if row >= 0:
@@ -201,7 +208,7 @@ def first_action_to_goal(store, grids, b, slot, x, y, heading, goal_x, goal_y): 
     kept = slot >= 0 and store.visits[slot] >= 2
     if kept and store.goal_first[slot, pose] >= 0:
         return np.int64(store.goal_first[slot, pose])
-    length = astar(grids, b, x, y, heading, goal_x, goal_y, -1, False, store.scratch)
+    length = way_to_cell(grids, b, x, y, heading, goal_x, goal_y, store.scratch)
     action = np.int64(store.scratch.path[0]) if length > 0 else np.int64(STAY)
     if kept:
         store.goal_first[slot, pose] = action
@@ -215,6 +222,7 @@ __all__ = [
     "enter_map",
     "first_action",
     "first_action_to_goal",
+    "hash_of_map",
     "longest_plan",
     "map_hash",
     "shared_store",

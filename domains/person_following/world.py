@@ -35,14 +35,14 @@ class World(NamedTuple):
     """The state of B environments."""
 
     grid: NDArray[np.uint8]  # [B, size, size]: cell kinds, the cell freed where the person started
-    robot: NDArray[np.int32]  # [B, ROBOT_COLUMNS]: see above
-    person: NDArray[np.int32]  # [B, PERSON_COLUMNS]
+    robot: NDArray[np.int64]  # [B, ROBOT_COLUMNS]: see above
+    person: NDArray[np.int64]  # [B, PERSON_COLUMNS]
     plan: NDArray[np.int8]  # [B, longest plan]: the person's actions
     known: NDArray[np.uint8]  # [B, size, size]: cells as the person believes them; [0, ...] where it knows all
     sight: NDArray[np.uint8]  # [B, v, v]: the persons' views, where the rules need them
-    others: NDArray[np.int32]  # [B, N - 1, PERSON_COLUMNS]: persons who are not to be followed
+    others: NDArray[np.int64]  # [B, N - 1, PERSON_COLUMNS]: persons who are not to be followed
     other_plan: NDArray[np.int8]  # [B, N - 1, longest plan]
-    goals: NDArray[np.int32]  # [B, MAX_GOALS, 2]: candidate cells, the first `num_goals` of them in use
+    goals: NDArray[np.int64]  # [B, MAX_GOALS, 2]: candidate cells, the first `num_goals` of them in use
     stream: NDArray[np.uint64]  # [B, 6]: random streams
     map_id: NDArray[np.int64]  # [B]
 
@@ -74,14 +74,14 @@ def allocate_world(num_envs: int, parameters: Parameters) -> World:
     size = parameters.size
     return World(
         grid=np.zeros((num_envs, size, size), np.uint8),
-        robot=np.zeros((num_envs, ROBOT_COLUMNS), np.int32),
-        person=np.zeros((num_envs, PERSON_COLUMNS), np.int32),
+        robot=np.zeros((num_envs, ROBOT_COLUMNS), np.int64),
+        person=np.zeros((num_envs, PERSON_COLUMNS), np.int64),
         plan=np.zeros((num_envs, longest_plan(size)), np.int8),
         known=np.zeros((num_envs if parameters.person_knows == "seen" else 0, size, size), np.uint8),
         sight=np.zeros((num_envs, parameters.view_size, parameters.view_size), np.uint8),
-        others=np.zeros((num_envs, parameters.num_persons - 1, PERSON_COLUMNS), np.int32),
+        others=np.zeros((num_envs, parameters.num_persons - 1, PERSON_COLUMNS), np.int64),
         other_plan=np.zeros((num_envs, parameters.num_persons - 1, longest_plan(size)), np.int8),
-        goals=np.zeros((num_envs, MAX_GOALS, 2), np.int32),
+        goals=np.zeros((num_envs, MAX_GOALS, 2), np.int64),
         stream=np.zeros((num_envs, STREAM_WIDTH), np.uint64),
         map_id=np.zeros(num_envs, np.int64),
     )

@@ -20,7 +20,7 @@ from domains.core import FORWARD, LEFT, DomainError
 from domains.person_following.bayes import BayesSearch
 from domains.person_following.beliefs import POSE, WORLD, Belief, Gains, Worlds
 from domains.person_following.oracles import sweep
-from domains.person_following.paths import allocate_scratch, astar, step_x, step_y
+from domains.person_following.paths import STEPS, allocate_scratch, find_path
 from domains.person_following.person_chain import NEVER, PersonChain, chain_of
 from domains.person_following.variants import Parameters
 
@@ -54,11 +54,11 @@ def told_at(chain: PersonChain, k: int, parameters: Parameters) -> PersonChain:
     goal_x, goal_y = (int(v) for v in chain.goals[1])
     scratch = allocate_scratch(len(chain.grid))
     x, y, h = (int(v) for v in chain.person[k])
-    length = astar(chain.grid_after[None], 0, x, y, h, goal_x, goal_y, -1, False, scratch)
+    length = find_path(chain.grid_after[None], 0, x, y, h, goal_x, goal_y, -1, False, scratch)
     route = chain.person[: k + 1].tolist()
     for action in scratch.path[: max(length, 0)].tolist():
         if action == FORWARD:
-            x, y = x + step_x(h), y + step_y(h)
+            x, y = x + STEPS[h][0], y + STEPS[h][1]
         else:
             h = (h + (3 if action == LEFT else 1)) % 4
         route.append([x, y, h])

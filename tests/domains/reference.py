@@ -7,6 +7,7 @@ rules can be held against it step by step.
 from __future__ import annotations
 
 import heapq
+from functools import lru_cache
 
 STEPS = {0: (1, 0), 1: (0, 1), 2: (-1, 0), 3: (0, -1)}
 LEFT, RIGHT, FORWARD, STAY = 0, 1, 2, 3
@@ -14,6 +15,13 @@ LEFT, RIGHT, FORWARD, STAY = 0, 1, 2, 3
 
 def astar(grid, start, goal, goal_heading, compare):
     """The A* of the task: actions from `start` (x, y, heading) to the cell `goal`, or None."""
+    walls = tuple(tuple(cell == 1 for cell in column) for column in grid)
+    path = _astar(walls, start, goal, goal_heading, compare)
+    return None if path is None else list(path)
+
+
+@lru_cache(maxsize=200_000)
+def _astar(walls, start, goal, goal_heading, compare):
 
     def heuristic(x, y, h):
         value = abs(x - goal[0]) + abs(y - goal[1])
@@ -33,12 +41,12 @@ def astar(grid, start, goal, goal_heading, compare):
             while came[node] is not None:
                 node, action = came[node]
                 actions.append(action)
-            return actions[::-1]
+            return tuple(actions[::-1])
         forward = (x + STEPS[h][0], y + STEPS[h][1], h)
         for action, following in ((LEFT, (x, y, (h - 1) % 4)), (RIGHT, (x, y, (h + 1) % 4)), (FORWARD, forward)):
-            if not (0 <= following[0] < len(grid) and 0 <= following[1] < len(grid)):
+            if not (0 <= following[0] < len(walls) and 0 <= following[1] < len(walls)):
                 continue
-            if grid[following[0]][following[1]] == 1:
+            if walls[following[0]][following[1]]:
                 continue
             new_cost = cost[node] + 1
             if following not in cost or new_cost < cost[following]:
