@@ -153,8 +153,8 @@ class CompareConfig:
     """What is compared: the grid of agents x input sets x influence modes x variants x seeds."""
 
     agents: tuple[str, ...] = tuple(agent for agent in AGENTS[:-2] if agent != "qmdp")
-    """Which agents: dqn, pomdp (pomdp-py), search, qmdp, greedy-follower, greedy-last-seen, random, and the exact oracles
-    optimum (full state), bayes-optimum and egocentric-optimum (where the task is small enough)."""
+    """Which agents: dqn, pomdp (pomdp-py), search, qmdp, greedy-follower, greedy-last-seen, random, and the exact
+    oracles optimum (full state), bayes-optimum and egocentric-optimum (where the task is small enough)."""
     inputs: tuple[str, ...] = ("full",)
     """Input sets of the DQN: paper (b, b~) or full (b, b~ and the configuration)."""
     influences: tuple[str, ...] = ("random", "perspective-shift", "perfect-information")
