@@ -1,0 +1,123 @@
+"""Certify the planners of explicit POMDPs against published values.
+
+    python scripts/certify_planners.py [--problems tiger 4,4 5,5 7,8] [--episodes N] [--seconds S] [--json FILE]
+
+For each problem: the solver's bounds, and what acting on the online search is worth (exactly where every belief that
+can come up can be enumerated, else the mean of episodes with a 95 % interval). Exit status 1 where a mark is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from domains.classic import rocksample, tiger
+from planners.point_based import solve
+from planners.pomdp import TabularPOMDP
+from planners.search import TreeSearch, closed_loop, exact_return
+
+
+@dataclass(frozen=True)
+class Mark:
+    """What a problem has to reach: published value, gap of the bounds, least return of the search, exactly or not."""
+
+    value: float
+    gap: float
+    least: float
+    exact: bool
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a problem reached; `error` is half the width of the 95 % interval, 0 for an exact value."""
+
+    problem: str
+    published: float
+    lower: float
+    upper: float
+    solver_seconds: float
+    search: float
+    error: float
+    decision_seconds: float
+    passed: bool
+
+
+MARKS = {
+    "tiger": Mark(19.371, 1e-3, 0.98 * 19.371, True),
+    "4,4": Mark(17.925, 0.05 * 17.925, 0.95 * 17.925, True),
+    "5,5": Mark(19.237, 0.05 * 19.237, 0.95 * 19.237, False),
+    "7,8": Mark(21.47, np.inf, 20.5, False),
+}
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--problems", nargs="+", choices=list(MARKS), default=list(MARKS))
+    parser.add_argument("--episodes", type=int, default=200, help="of problems whose beliefs cannot be enumerated")
+    parser.add_argument("--seconds", type=float, default=1.0, help="per decision, for 7,8")
+    parser.add_argument("--solver-seconds", type=float, default=120.0)
+    parser.add_argument("--json", type=Path, default=None, help="also write the outcomes to this file")
+    arguments = parser.parse_args()
+    outcomes = []
+    print("| problem | published | solver's bounds (s) | search | s per decision | mark |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for problem in arguments.problems:
+        done = certify(problem, arguments.episodes, arguments.seconds, arguments.solver_seconds)
+        outcomes.append(asdict(done))
+        spread = f" +- {done.error:.2f}" if done.error else " (exact)"
+        print(
+            f"| {problem} | {done.published:.3f} | {done.lower:.3f} to {done.upper:.3f} ({done.solver_seconds:.0f}) | "
+            f"{done.search:.3f}{spread} | {done.decision_seconds:.3f} | {'met' if done.passed else 'MISSED'} |",
+            flush=True,
+        )
+    if arguments.json:
+        arguments.json.write_text(json.dumps(outcomes, indent=2) + "\n", encoding="utf-8")
+    return 0 if all(outcome["passed"] for outcome in outcomes) else 1
+
+
+def certify(problem: str, episodes: int, seconds: float, solver_seconds: float) -> Outcome:
+    """Bounds and search of one problem."""
+    mark = MARKS[problem]
+    model = TabularPOMDP(**(tiger() if problem == "tiger" else rocksample(*map(int, problem.split(",")))))
+    certificate = solve(model, gap=min(mark.gap, 0.05 * mark.value), time_limit=solver_seconds)
+    large = problem == "7,8"
+    search = TreeSearch(
+        model,
+        np.random.default_rng(0),
+        simulations=20_000 if large else 200,
+        time_limit=seconds if large else 0.0,
+        trials=200 if large else 20,
+        reuse=not mark.exact,
+    )
+    search.plan(model.start)  # compiles the kernels
+    started = time.perf_counter()
+    search.plan(model.start)
+    decision = time.perf_counter() - started
+    if mark.exact:
+        reached, error = exact_return(search, least=1e-4), 0.0
+    else:
+        returns = [closed_loop(search, 100, np.random.default_rng([1, episode])) for episode in range(episodes)]
+        reached, error = float(np.mean(returns)), 1.96 * float(np.std(returns) / np.sqrt(episodes))
+    bracketed = certificate.lower <= mark.value + 5e-3 and certificate.upper >= mark.value - 5e-3
+    return Outcome(
+        problem=problem,
+        published=mark.value,
+        lower=certificate.lower,
+        upper=certificate.upper,
+        solver_seconds=certificate.seconds,
+        search=reached,
+        error=error,
+        decision_seconds=decision,
+        passed=bracketed and certificate.upper - certificate.lower <= mark.gap and reached + error >= mark.least,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
