@@ -6,8 +6,11 @@ import pytest
 from nesy import formats
 from nesy.dbn.inference import most_probable_next
 from nesy.errors import UserError
+from nesy.formats.execution import by_fast_downward, execute
 from nesy.formats.rddl import MAX_ENTRIES
+from tests.nesy.dbn.extracted import extracted_run
 from tests.nesy.dbn.models import all_codes, random_dbn, transition_matrix
+from tests.nesy.dbn.steps import with_steps
 from tests.nesy.dbn.toy import toy
 
 
@@ -32,34 +35,68 @@ def test_pyrddlgym_simulates_the_model_within_its_sampling_error(tmp_path, arcs)
 
 
 @pytest.mark.check
-def test_a_plan_of_fast_downward_reaches_its_goal_in_the_model(tmp_path):
-    pytest.importorskip("up_fast_downward")
-    from unified_planning.io import PDDLReader
-    from unified_planning.shortcuts import OneshotPlanner, get_environment
+def test_pyrddlgym_knows_rewards_and_endings(tmp_path):
+    pyrddlgym = pytest.importorskip("pyRDDLGym")
+    rng = np.random.default_rng(6)
+    dbn = with_steps(random_dbn(rng, num_factors=2, num_values=3, arcs=False), rng, next_parents=True)
+    formats.export(dbn, tmp_path / "m.rddl", start=np.array([1, 2]))
+    environment = pyrddlgym.make(str(tmp_path / "m.rddl"), str(tmp_path / "m_instance.rddl"))
+    environment.reset(seed=0)
+    rewards, ends, draws = [], [], 1000
+    for _ in range(draws):
+        environment.reset()
+        _, reward, terminated, *_ = environment.step({"do_a0": True})
+        rewards.append(reward)
+        ends.append(terminated)
+    codes, row = all_codes(dbn), transition_matrix(dbn, 0)[1 * 3 + 2]
+    step = (np.tile([1, 2], (9, 1)), np.zeros(9, dtype=int), codes)
+    pays = dbn.step_tables["reward"].look_up(*step)[:, 0, 0]
+    ending = float(row @ dbn.step_tables["termination"].look_up(*step)[:, 0, 1])
+    spread = np.sqrt(max(row @ pays**2 - (row @ pays) ** 2, 1e-12) / draws)
+    assert abs(np.mean(rewards) - row @ pays) <= 4 * spread + 1e-9
+    assert abs(np.mean(ends) - ending) <= 4 * np.sqrt(ending * (1 - ending) / draws) + 1e-9
 
-    get_environment().credits_stream = None
+
+@pytest.mark.check
+def test_a_plan_of_fast_downward_reaches_its_goal_in_the_model():
+    pytest.importorskip("up_fast_downward")
     solved = 0
-    for seed in range(8):
+    for seed in range(6):
         rng = np.random.default_rng(seed)
         dbn = random_dbn(rng, num_factors=3, num_values=3, num_actions=3, concentration=0.1)
         codes = all_codes(dbn)
         start = codes[rng.integers(len(codes))]
-        distance = shortest(dbn, start, beam=1)
+        distance = shortest(dbn, start)
         goal = max(distance, key=distance.get)
         if distance[goal] == 0:
             continue
-        formats.export(dbn, tmp_path / "m.pddl", start=start, goals=np.array([goal]))
-        problem = PDDLReader().parse_problem(str(tmp_path / "m.pddl"), str(tmp_path / "m_problem.pddl"))
-        with OneshotPlanner(name="fast-downward") as planner:
-            result = planner.solve(problem)
-        steps = [action.action.name for action in result.plan.actions]
-        assert steps[-1] == "arrive-0" and len(steps) >= distance[goal] + 1
+        plan = by_fast_downward(dbn, start, np.array([goal]))
+        assert len(plan) == distance[goal]
         code = start
-        for step in steps[:-1]:
-            code = most_probable_next(dbn, code[None], dbn.action_names.index(step), beam=1)[0][0]
+        for action, there in plan:
+            code = most_probable_next(dbn, code[None], action)[0][0]
+            assert tuple(code) == there
         assert tuple(code) == goal
         solved += 1
     assert solved >= 3
+
+
+@pytest.mark.check
+def test_plans_of_fast_downward_are_executed_in_the_environment():
+    pytest.importorskip("up_fast_downward")
+    from domains.core import load_domain
+    from nesy.dbn.codebook import Codebook
+    from nesy.dbn.model import TwoSliceDBN
+    from nesy.world_model import SymbolicCodec, load_world_model
+
+    _, run, _ = extracted_run()
+    codec = SymbolicCodec(load_world_model(run.world_model))
+    dbn, codebook = TwoSliceDBN.load(run.dbn), Codebook.load(run.dbn)
+    done = execute(load_domain(), "paper", dbn, codebook, codec.codes, 1, seed=0, longest=40, outcomes=2)
+    assert done.episodes == 1 and done.calls >= 1 and done.steps <= 40
+    # every step was planned, wandered, or the last one onto the goal
+    assert done.wandering < done.steps
+    assert done.reached == 1
 
 
 def shortest(dbn, start, beam=16):
@@ -76,14 +113,28 @@ def shortest(dbn, start, beam=16):
     return distance
 
 
-def test_pddl_has_a_conditional_effect_for_every_context_that_changes_something(tmp_path):
+def test_pddl_has_an_action_for_every_code_and_change(tmp_path):
     formats.export(toy()[0], tmp_path / "m.pddl", start=np.array([0, 1, 0]), goals=np.array([[1, 0, 0]]))
     domain = (tmp_path / "m.pddl").read_text()
-    # swap: front takes the value of side, whatever it was
-    assert "(when (and (x1-1)) (and (not (x0-0)) (not (x0-2)) (x0-1)))" in domain
-    # go: the side opens up where the front is free
-    assert "(when (and (x0-0) (x1-1)) (and (not (x1-1)) (x1-0)))" in domain
+    # swap: front takes the value of side, side that of front; codes are numbered in order, (0, 1, 0) is the third
+    assert "(:action swap-2 :parameters ()" in domain
+    assert (
+        ":precondition (and (x0-0) (x1-1) (x2-0))\n    :effect (and (not (x0-0)) (x0-1) (not (x1-1)) (x1-0)))" in domain
+    )
     assert "(:init (x0-0) (x1-1) (x2-0))" in (tmp_path / "m_problem.pddl").read_text()
+    assert ":action-costs" not in domain
+
+
+def test_pddl_of_the_reachable_part_and_of_several_outcomes(tmp_path):
+    dbn = random_dbn(np.random.default_rng(0), concentration=0.3)
+    start = np.array([0, 1, 2])
+    formats.export(dbn, tmp_path / "all.pddl", start=start)
+    formats.export(dbn, tmp_path / "part.pddl", start=start, reachable=True)
+    formats.export(dbn, tmp_path / "more.pddl", start=start, outcomes=3, goal={0: 1})
+    counts = [(tmp_path / f"{name}.pddl").read_text().count("(:action") for name in ("part", "all", "more")]
+    assert 0 < counts[0] < counts[1] < counts[2]
+    assert "minimize (total-cost)" in (tmp_path / "more_problem.pddl").read_text()
+    assert "(:goal (and (x0-1)))" in (tmp_path / "more_problem.pddl").read_text()
 
 
 def test_large_models_write_only_the_rows_met(tmp_path):
