@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import os
 import resource
+import signal
 import subprocess
 import sys
 import tempfile
@@ -93,6 +94,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("options", nargs="*", default=list(SMOKE), help="options of `nesy run`, after --")
     options = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     rng = np.random.default_rng(options.seed)
     runs, good = -(-options.fills // options.fills_per_run), 0
     with tempfile.TemporaryDirectory() as scratch:

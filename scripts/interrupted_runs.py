@@ -45,7 +45,11 @@ def finish(folder: Path, options: Sequence[str]) -> tuple[int, str, float]:
     """Run to the end: status, standard error, seconds."""
     started = time.perf_counter()
     process = start(folder, options)
-    _, said = process.communicate()
+    try:
+        _, said = process.communicate()
+    except BaseException:  # we are being stopped: do not leave the run behind
+        os.killpg(process.pid, signal.SIGKILL)
+        raise
     return process.returncode, said.decode(errors="replace"), time.perf_counter() - started
 
 
@@ -57,6 +61,9 @@ def interrupt(folder: Path, options: Sequence[str], after: float, number: int) -
         return None, ""
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, number)
+    except BaseException:
+        os.killpg(process.pid, signal.SIGKILL)
+        raise
     _, said = process.communicate()
     return process.returncode, said.decode(errors="replace")
 
@@ -140,6 +147,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("options", nargs="*", default=list(SMOKE), help="options of `nesy run`, after --")
     options = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     rng = np.random.default_rng(options.seed)
     good = 0
     runs = -(-options.kills // options.kills_per_run)
