@@ -42,4 +42,5 @@ def overload(function: Callable[..., Any]) -> Callable[..., Any]:
     """`numba.extending.overload(function)`: choose by the types of the arguments what compiled code runs for it."""
     from numba.extending import overload as by_types
 
-    return by_types(function, strict=False)  # type: ignore[no-any-return]
+    decorator: Callable[..., Any] = by_types(function, strict=False)
+    return decorator

@@ -33,7 +33,7 @@ class FlatPOMDP(NamedTuple):
 
 
 class BoundSet(NamedTuple):
-    """Both bounds as arrays; `count` int64 [2] says how many vectors and points are in use.
+    """Both bounds as arrays; `used` int64 [2] says how many vectors and points are in use.
 
     Attributes:
         blind: float64 [A, S], value of always doing one action.
@@ -54,7 +54,7 @@ class BoundSet(NamedTuple):
     point_index: np.ndarray
     point_value: np.ndarray
     point_gain: np.ndarray
-    count: np.ndarray
+    used: np.ndarray
 
 
 def flatten(model: TabularPOMDP) -> FlatPOMDP:
@@ -90,7 +90,7 @@ def lower_at(bounds: BoundSet, index: np.ndarray, value: np.ndarray, dense: np.n
             best, which = total, a
     for i in range(size):
         dense[index[i]] = value[i]
-    for m in range(bounds.count[0]):
+    for m in range(bounds.used[0]):
         begin, end = bounds.alpha_begin[m], bounds.alpha_begin[m + 1]
         if end - begin < size or bounds.alpha_index[begin] > index[0] or bounds.alpha_index[end - 1] < index[size - 1]:
             continue
@@ -115,7 +115,7 @@ def upper_at(bounds: BoundSet, index: np.ndarray, value: np.ndarray, dense: np.n
         base += bounds.corner[index[i]] * value[i]
         dense[index[i]] = value[i]
     best = 0.0
-    for p in range(bounds.count[1]):
+    for p in range(bounds.used[1]):
         gain = bounds.point_gain[p]
         ratio = np.inf
         for j in range(bounds.point_begin[p], bounds.point_begin[p + 1]):
@@ -254,7 +254,7 @@ def undominated(bounds: BoundSet, group: np.ndarray) -> np.ndarray:
 
     Of equal ones the first stays.
     """
-    count = bounds.count[0]
+    count = bounds.used[0]
     keep = np.ones(count, np.bool_)
     for i in range(count):
         at, size = bounds.alpha_begin[i], bounds.alpha_begin[i + 1] - bounds.alpha_begin[i]

@@ -31,7 +31,7 @@ class BeliefTree(NamedTuple):
         chance: float64 [capacity], of the observation that leads here.
         q_lower, q_upper: float64 [capacity, A]; -inf where an action is not allowed.
         child: int64 [capacity, A, O], -1 where there is none.
-        begin: int64 [capacity, 2], where an expanded node's belief lies in `index` and `value`; -1 before.
+        begin: int64 [capacity, 2], where an expanded node's belief lies in `held` and `value`; -1 before.
         visits: int64 [capacity], expansions at and below the node.
     """
 
@@ -50,7 +50,7 @@ class BeliefTree(NamedTuple):
     child: np.ndarray
     begin: np.ndarray
     visits: np.ndarray
-    index: np.ndarray
+    held: np.ndarray
     value: np.ndarray
 
 
@@ -106,7 +106,7 @@ def _hold(tree: BeliefTree, node: int, index: np.ndarray, value: np.ndarray) -> 
     begin = tree.size[1]
     end = begin + index.shape[0]
     tree.begin[node, 0], tree.begin[node, 1] = begin, end
-    tree.index[begin:end] = index
+    tree.held[begin:end] = index
     tree.value[begin:end] = value
     tree.size[1] = end
 
@@ -131,16 +131,16 @@ def grow(flat: FlatPOMDP, bounds: BoundSet, tree: BeliefTree, count: int, allowe
             up = tree.parent[node]
             at, end = tree.begin[up, 0], tree.begin[up, 1]
             index, value, _ = follow(
-                flat, tree.index[at:end], tree.value[at:end], tree.action[node], tree.seen[node], dense
+                flat, tree.held[at:end], tree.value[at:end], tree.action[node], tree.seen[node], dense
             )
-            if tree.size[1] + index.shape[0] > tree.index.shape[0]:
+            if tree.size[1] + index.shape[0] > tree.held.shape[0]:
                 return done
             _hold(tree, node, index, value)
         at, end = tree.begin[node, 0], tree.begin[node, 1]
         look(
             flat,
             bounds,
-            tree.index[at:end],
+            tree.held[at:end],
             tree.value[at:end],
             dense,
             other,
@@ -236,5 +236,5 @@ def reroot(tree: BeliefTree, action: int, seen: int, target: BeliefTree) -> bool
                 target.best[parent] = new
         if tree.begin[node, 0] >= 0:
             at, end = tree.begin[node, 0], tree.begin[node, 1]
-            _hold(target, new, tree.index[at:end], tree.value[at:end])
+            _hold(target, new, tree.held[at:end], tree.value[at:end])
     return True

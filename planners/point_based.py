@@ -86,7 +86,7 @@ def solve(model: TabularPOMDP, gap: float = 1e-3, time_limit: float = 60.0, max_
     return Certificate(
         lower=bounds.lower(start),
         upper=bounds.upper(start),
-        vectors=int(bounds.arrays.count[0]),
+        vectors=int(bounds.arrays.used[0]),
         trials=trials,
         seconds=time.perf_counter() - started,
         bounds=bounds,
@@ -202,7 +202,7 @@ class PointBounds:
 
     def sweep(self, start: Belief, gap: float) -> None:
         """Where the points are few, improve all of them until little changes: values then travel round cycles."""
-        points = int(self.arrays.count[1])
+        points = int(self.arrays.used[1])
         if points * self.chances.size > _FEW:
             return
         before = np.inf
@@ -242,9 +242,9 @@ class PointBounds:
 
     def _add_alpha(self, index: np.ndarray, action: int) -> None:
         made = kernels.backed_up(self.flat, self.arrays, action, self.chosen[action], index)
-        if self.arrays.count[0] == self.prune_at:
+        if self.arrays.used[0] == self.prune_at:
             self._prune()
-        count = int(self.arrays.count[0])
+        count = int(self.arrays.used[0])
         begin = int(self.arrays.alpha_begin[count])
         end = begin + len(index)
         self.arrays = self.arrays._replace(
@@ -255,11 +255,11 @@ class PointBounds:
         )
         self.arrays.alpha_index[begin:end], self.arrays.alpha_value[begin:end] = index, made
         self.arrays.alpha_begin[count + 1], self.arrays.alpha_action[count] = end, action
-        self.arrays.count[0] = count + 1
+        self.arrays.used[0] = count + 1
 
     def _prune(self) -> None:
         """Drop vectors that another one over the same states is at least as good as."""
-        arrays, count = self.arrays, int(self.arrays.count[0])
+        arrays, count = self.arrays, int(self.arrays.used[0])
         spans = list(zip(arrays.alpha_begin[:count], arrays.alpha_begin[1 : count + 1], strict=True))
         groups: dict[bytes, int] = {}
         group = np.array([groups.setdefault(arrays.alpha_index[i:j].tobytes(), len(groups)) for i, j in spans])
@@ -270,7 +270,7 @@ class PointBounds:
         arrays.alpha_value[: len(entries)] = arrays.alpha_value[entries]
         arrays.alpha_begin[1 : len(kept) + 1] = np.cumsum(sizes)
         arrays.alpha_action[: len(kept)] = arrays.alpha_action[kept]
-        arrays.count[0] = len(kept)
+        arrays.used[0] = len(kept)
         self.prune_at = 2 * len(kept) + _ROOM
 
     def _add_point(self, belief: Belief, value: float) -> None:
@@ -280,7 +280,7 @@ class PointBounds:
         if key in self.point_of:
             self.arrays.point_gain[self.point_of[key]] = gain
             return
-        count = int(self.arrays.count[1])
+        count = int(self.arrays.used[1])
         begin = int(self.arrays.point_begin[count])
         end = begin + len(index)
         self.arrays = self.arrays._replace(
@@ -292,7 +292,7 @@ class PointBounds:
         self.point_of[key] = count
         self.arrays.point_index[begin:end], self.arrays.point_value[begin:end] = index, mass
         self.arrays.point_begin[count + 1], self.arrays.point_gain[count] = end, gain
-        self.arrays.count[1] = count + 1
+        self.arrays.used[1] = count + 1
 
 
 def _with_room(array: np.ndarray, size: int) -> np.ndarray:

@@ -220,15 +220,17 @@ class _Reader:
         if self.peek() != ":":
             rows = self.block((count, count))
             for a in actions:
-                table[a] = [{s: 1.0} for s in range(count)] if rows is None else list(rows)
+                for s in range(count):
+                    table[a][s] = {s: 1.0} if rows is None else rows[s]
             return
         self.colon()
         states = self.which("states")
         if self.peek() != ":":
-            row = self.block((count,))
+            whole = self.block((count,))
+            assert whole is not None
             for a in actions:
                 for s in states:
-                    table[a][s] = row
+                    table[a][s] = whole
             return
         self.colon()
         after, chance = self.which("states"), self.number()

@@ -161,7 +161,7 @@ class TreeSearch:
     def _goes_on(self, belief: np.ndarray, mask: np.ndarray) -> bool:
         """Whether the tree at hand is what `update` kept for this belief; notes what the next tree is grown for."""
         kept = self._carried and self._planted is not None and bool(mask.all())
-        kept = kept and bool(np.allclose(self._planted, belief, atol=1e-9))
+        kept = kept and bool(np.allclose(np.asarray(self._planted), belief, atol=1e-9))
         self._planted, self._carried = (belief if mask.all() else None), False
         return kept
 

@@ -85,7 +85,11 @@ def main() -> int:
 def certify(problem: str, episodes: int, seconds: float, solver_seconds: float) -> Outcome:
     """Bounds and search of one problem."""
     mark = MARKS[problem]
-    model = TabularPOMDP(**(tiger() if problem == "tiger" else rocksample(*map(int, problem.split(",")))))
+    if problem == "tiger":
+        model = TabularPOMDP(**tiger())
+    else:
+        size, rocks = map(int, problem.split(","))
+        model = TabularPOMDP(**rocksample(size, rocks))
     certificate = solve(model, gap=min(mark.gap, 0.05 * mark.value), time_limit=solver_seconds)
     large = problem == "7,8"
     search = TreeSearch(

@@ -82,7 +82,7 @@ def test_rocksample_is_that_of_the_literature() -> None:
     arrays = rocksample(4, 4)
     model = TabularPOMDP(**arrays)
     assert (len(model.states), len(model.actions), len(model.observations)) == (257, 9, 2)
-    assert model.states[model.start.argmax()].startswith("s02")
+    assert model.states[int(model.start.argmax())].startswith("s02")
     assert model.terminal.sum() == 1
     north, east, sample = (model.actions.index(name) for name in ("amn", "ame", "as"))
     rock, edge = model.states.index("s131111"), model.states.index("s301111")
@@ -155,7 +155,8 @@ def test_words_and_wildcards_for_rows(tmp_path: Path) -> None:
     assert np.allclose(model.transition[1].toarray(), [[1, 0, 0]] * 3)
     assert np.allclose(model.observation.sum(axis=2), 1.0)
     assert model.observation[0, 2].tolist() == [0.5, 0.5]
-    assert np.allclose(model.reward, [[1, 1 + 6 / 3 * 0.5, 1], [-2, 1, 3 / 3 + 6 * 2 / 3]], atol=1e-5)
+    wanted = np.array([[1.0, 1 + 6 / 3 * 0.5, 1.0], [-2.0, 1.0, 3 / 3 + 6 * 2 / 3]])
+    assert np.allclose(model.reward, wanted, atol=1e-5)
 
 
 def test_large_files_are_read_sparsely(tmp_path: Path) -> None:

@@ -53,7 +53,7 @@ def random_model(seed: int) -> TabularPOMDP:
 
 def brute_force(model: TabularPOMDP, steps: list[tuple[int, int]]) -> np.ndarray:
     """The posterior over the last state, by adding up every path of states: float64 [S]."""
-    weights = {(s,): float(model.start[s]) for s in range(len(model.states))}
+    weights: dict[tuple[int, ...], float] = {(s,): float(model.start[s]) for s in range(len(model.states))}
     for action, seen in steps:
         matrix = model.transition[action].toarray()
         weights = {

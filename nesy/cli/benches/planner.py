@@ -78,7 +78,7 @@ def _pomdp_py_on_factors(model: Any, belief: np.ndarray, rng: np.random.Generato
     bits = stream(rng)
     seen = int(model.seen[0])
 
-    class State(pomdp_py.State):  # type: ignore[misc]
+    class State(pomdp_py.State):
         def __init__(self, code: np.ndarray) -> None:
             self.code = code
 
@@ -88,28 +88,28 @@ def _pomdp_py_on_factors(model: Any, belief: np.ndarray, rng: np.random.Generato
         def __eq__(self, other: object) -> bool:
             return isinstance(other, State) and bool((self.code == other.code).all())
 
-    class Transition(pomdp_py.TransitionModel):  # type: ignore[misc]
+    class Transition(pomdp_py.TransitionModel):
         def sample(self, state: Any, action: Any) -> Any:
             after = np.empty(_FACTORS, np.int16)
             next_code(model.codes, state.code, 0, int(action.name), after, 0, bits)
             return State(after)
 
-    class Observation(pomdp_py.ObservationModel):  # type: ignore[misc]
+    class Observation(pomdp_py.ObservationModel):
         def sample(self, next_state: Any, action: Any) -> Any:
             return pomdp_py.SimpleObservation(int(next_state.code[seen]))
 
-    class Reward(pomdp_py.RewardModel):  # type: ignore[misc]
+    class Reward(pomdp_py.RewardModel):
         def sample(self, state: Any, action: Any, next_state: Any) -> float:
             return float(model.reward[0, next_state.code[0]])
 
-    class Policy(pomdp_py.RolloutPolicy):  # type: ignore[misc]
+    class Policy(pomdp_py.RolloutPolicy):
         def get_all_actions(self, state: Any = None, history: Any = None) -> list[Any]:
             return actions
 
         def rollout(self, state: Any, history: Any = None) -> Any:
             return actions[int(uniform(bits) * _ACTIONS)]
 
-    class Particles(pomdp_py.GenerativeDistribution):  # type: ignore[misc]
+    class Particles(pomdp_py.GenerativeDistribution):
         def random(self) -> Any:
             return State(belief[rng.integers(len(belief))])
 
@@ -140,7 +140,7 @@ def _tiger(settings: Settings) -> list[Row]:
         search.update(0, 0)  # the tree of the last call is not gone on with
         return int(search.plan(model.start)[1]["simulations"])
 
-    class Search(pomdp_py.POUCT):  # type: ignore[misc]
+    class Search(pomdp_py.POUCT):
         def _rollout(self, state: Any, history: Any, root: Any, depth: int) -> float:
             return 0.0
 
@@ -173,7 +173,7 @@ def _decision(settings: Settings) -> list[Row]:
     compiled, rng = compile_model(model), np.random.default_rng(settings.seed)
     search = IALMSearch(model, compiled, config, rng)
     prior = np.full((model.num_factors, model.num_values), 1.0 / model.num_values)
-    times = []
+    times: list[float] = []
     started = time.perf_counter()
     while len(times) < 21 or time.perf_counter() - started < settings.seconds:
         belief = ParticleBelief(model, compiled, config.particles, rng)
