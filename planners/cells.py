@@ -88,6 +88,25 @@ def restored_player(cell: Cell, run: RunFolder, domain: Domain, config: CompareC
     return _stored(cell, path, codec, action_mask(config, codec, domain), cell_seed(cell, seed)).player
 
 
+def agent_from_file(path: Path, run: RunFolder | None = None) -> tuple[DQNAgent, Perception]:
+    """A trained policy ready to act, with its perception.
+
+    Args:
+        path: the policy; that of a run lies in its folder `policies`.
+        run: holds the world model; by default the run that the policy lies in.
+
+    Raises:
+        UserError: no policy, or no world model.
+    """
+    from planners.dqn import DQNPolicy
+    from planners.published import dqn_perception
+
+    policy = DQNPolicy.load(path)
+    codec = _codec(run or RunFolder(path.resolve().parent.parent))
+    influence = str(policy.trained.get("influence", "perspective-shift"))
+    return DQNAgent(policy), dqn_perception(codec, influence, np.random.default_rng(0), policy.config)
+
+
 def action_mask(config: CompareConfig, codec: Codec, domain: Domain) -> ActionMask | None:
     """The rules of the comparison as a mask over actions; None where there are none."""
     if not config.rules:

@@ -1,7 +1,7 @@
 """Watch an episode, or drive the robot with the keyboard; record it as GIF (or MP4 where ffmpeg is installed).
 
 In a terminal: arrow keys or w/a/d move, space stays, r starts anew, q quits. Anywhere else, or with --agent,
-a policy drives: random, goal (A* to the goal), follower (A* to the person) or optimum (exact).
+a policy drives: random, goal (A* to the goal), follower (A* to the person), optimum (exact) or a trained one.
 """
 
 from __future__ import annotations
@@ -36,6 +36,8 @@ class Arguments:
     """Seed of the maps."""
     agent: Literal["keyboard", "random", "goal", "follower", "optimum"] = "keyboard"
     """Who drives."""
+    policy: Path | None = None
+    """Let this trained policy drive, such as runs/demo/policies/NAME.safetensors, with its run's world model."""
     episodes: int = 1
     """Episodes to play."""
     record: Path | None = None
@@ -52,13 +54,14 @@ def run(options: Arguments) -> dict[str, Any]:
         raise UserError(f"--episodes {options.episodes}: at least one episode is needed")
     if options.record is not None and options.record.suffix not in (".gif", ".mp4"):
         raise UserError(f"--record {options.record}: the ending must be .gif or .mp4")
-    if options.agent == "keyboard" and not sys.stdin.isatty():
+    by_hand = options.agent == "keyboard" and options.policy is None
+    if by_hand and not sys.stdin.isatty():
         raise UserError("--agent keyboard needs a terminal; name another driver, such as --agent follower")
     parameters: dict[str, Any] = {} if options.size is None else {"size": options.size}
     env = gymnasium.make("nesy/PersonFollowing-v0", variant=options.variant, render_mode="rgb_array", **parameters)
     frames: list[np.ndarray] = []
     episodes = []
-    with _keyboard() if options.agent == "keyboard" else _policy(env, options) as choose:
+    with _keyboard() if by_hand else _policy(env, options) as choose:
         for episode in range(options.episodes):
             result = _episode(env, choose, frames, options, seed=options.seed if episode == 0 else None)
             if result is None:
@@ -78,7 +81,7 @@ def _episode(
     while True:
         if options.record is not None:
             frames.append(env.render())
-        if options.agent == "keyboard":
+        if options.agent == "keyboard" and options.policy is None:
             _draw(env.unwrapped.state(), total, info)
         if ended:
             return {"return": round(total, 4), "length": steps, "outcome": info["outcome"]}
@@ -92,12 +95,27 @@ def _episode(
 @contextmanager
 def _policy(env: Any, options: Arguments) -> Iterator[Callable[[], int | None]]:
     rng = np.random.default_rng(options.seed)
-    if options.agent == "random":
+    if options.policy is not None:
+        yield _trained(env, options.policy)
+    elif options.agent == "random":
         yield lambda: int(rng.integers(4))
     elif options.agent == "optimum":
         yield _optimum(env, options)
     else:
         yield lambda: int(env.unwrapped.expert_action(options.agent))
+
+
+def _trained(env: Any, path: Path) -> Callable[[], int]:
+    from planners.cells import agent_from_file
+
+    agent, perception = agent_from_file(path)
+    batch = env.unwrapped.batch
+
+    def choose() -> int:
+        observation = {"view": batch.last.robot_view, "configuration": batch.last.configuration}
+        return int(agent.policy.actions(perception(observation, batch.describe()[0]))[0])
+
+    return choose
 
 
 def _optimum(env: Any, options: Arguments) -> Callable[[], int]:
