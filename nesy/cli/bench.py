@@ -78,14 +78,16 @@ def _lacking(suite: ModuleType, folder: Path) -> str:
 
 
 def show(result: dict[str, Any]) -> None:
-    """Print the tables."""
+    """Print one table of everything measured."""
+    table = Table(title="speeds on one core, each beside a named peer in the same run", title_justify="left")
+    for column in ("suite", "what", "figure", "unit", "ratio", "peer"):
+        table.add_column(column, justify="right" if column in ("figure", "ratio") else "left", no_wrap=True)
     for suite, rows in result["suites"].items():
-        table = Table(title=f"{suite}: on one core", title_justify="left")
-        for column in ("what", "figure", "unit", "ratio", "peer"):
-            table.add_column(column, justify="right" if column in ("figure", "ratio") else "left", no_wrap=True)
         for row in rows:
-            table.add_row(row["what"], _short(row["figure"]), row["unit"], f"{row['ratio']:.3g} x", row["peer"])
-        print_wide(table)
+            figure, ratio = _short(row["figure"]), f"{row['ratio']:.3g} x"
+            table.add_row(suite, row["what"], figure, row["unit"], ratio, row["peer"])
+        table.add_section()
+    print_wide(table)
     print(f"stored: {result['stored']}")
 
 

@@ -12,22 +12,14 @@ import pytest
 
 from nesy.cli.main import main
 from nesy.report.text import comparison_rows
+from tests.conftest import TINY
 
-TINY = [
-    *("--preset", "smoke", "--jobs", "1"),
-    *("--collect.crossing-episodes", "60", "--collect.following-episodes", "60"),
-    *("--train.epochs", "2"),
-    *("--compare.dqn.episodes", "64", "--compare.planner-episodes", "2", "--compare.episodes", "42"),
-    *("--compare.search.pomdp-py-simulations", "4"),
-]
 INFLUENCES = ("random", "perspective-shift", "perfect-information")
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("runs") / "tiny run"
-    assert main(["run", "--run", str(folder), *TINY]) == 0
-    return folder
+def run(tiny_run: Path) -> Path:
+    return tiny_run
 
 
 @pytest.fixture
