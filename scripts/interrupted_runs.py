@@ -68,6 +68,25 @@ def interrupt(folder: Path, options: Sequence[str], after: float, number: int) -
     return process.returncode, said.decode(errors="replace")
 
 
+def interrupt_when(folder: Path, options: Sequence[str], pattern: str, number: int = signal.SIGKILL) -> tuple[int, str]:
+    """Run until a file of the pattern is there, then send a signal to the whole group.
+
+    Raises:
+        RuntimeError: the run ended without such a file.
+    """
+    process = start(folder, options)
+    try:
+        while not any(folder.glob(pattern)):
+            if process.poll() is not None:
+                raise RuntimeError(f"the run ended with status {process.returncode} before there was a {pattern}")
+            time.sleep(0.01)
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, number)
+    _, said = process.communicate()
+    return process.returncode, said.decode(errors="replace")
+
+
 def half_written(folder: Path) -> list[str]:
     """Files that cannot be read; what a killed writer left under a temporary name does not count."""
     bad = []
