@@ -23,7 +23,7 @@ INSTANCES: dict[str, dict[str, Any]] = {
     "intent": {},
     "false_belief": {},
 }
-COLUMNS = ("full_state", "bayes", "egocentric", "greedy_follower", "greedy_last_seen")
+COLUMNS = ("full_state", "bayes", "egocentric", "egocentric_full_state", "greedy_follower", "greedy_last_seen")
 
 
 def main() -> None:
@@ -31,7 +31,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--variants", nargs="+", choices=sorted(INSTANCES), default=list(INSTANCES))
     parser.add_argument("--discount", type=float, default=None, help="left out: 0.9 for paper, 0.99 for others")
-    parser.add_argument("--bayes-seconds", type=float, default=60.0, help="time limit of each Bayes search")
+    parser.add_argument("--max-beliefs", type=int, default=200_000, help="where each Bayes search stops")
     parser.add_argument("--json", type=Path, default=None, help="also write the rows to this file")
     arguments = parser.parse_args()
     rows = []
@@ -39,7 +39,7 @@ def main() -> None:
     print("| --- | --- |" + " --- |" * len(COLUMNS))
     for variant in arguments.variants:
         discount = arguments.discount or (0.9 if variant == "paper" else 0.99)
-        row = oracle_row(variant, discount=discount, bayes_seconds=arguments.bayes_seconds, **INSTANCES[variant])
+        row = oracle_row(variant, discount=discount, max_beliefs=arguments.max_beliefs, **INSTANCES[variant])
         rows.append(row)
         cells = [_cell(row[name]) for name in COLUMNS]
         print(f"| {variant} {_changes(row['changes'])} | {row['worlds']} | " + " | ".join(cells) + " |", flush=True)

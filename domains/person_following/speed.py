@@ -6,6 +6,11 @@ maps, and for greedy play the expert's actions. Time is that of the processor, o
 
 from __future__ import annotations
 
+import os
+import resource
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -43,8 +48,8 @@ def benchmark(
 
     Args:
         variant: whose rules to play.
-        sizes: map sizes; all batches are measured at size 9, and 1024 at the others.
-        batches: numbers of environments.
+        sizes: map sizes.
+        batches: numbers of environments, measured at every size.
         seconds: how long to step for each row, after a warm-up.
         seed: of maps and random actions.
     """
@@ -55,8 +60,6 @@ def benchmark(
     for size in sizes:
         crossings = _CROSSINGS.get(size, max(1, size // 4))
         for batch in batches:
-            if size != sizes[0] and batch not in (1024, max(batches)):
-                continue
             for player in ("random", "greedy"):
                 rate = _batched(variant, size, crossings, batch, player, seconds, seed)
                 rows.append(SpeedRow("batch", size, crossings, batch, player, rate, rate / base))
@@ -109,4 +112,52 @@ def _batched(variant: str, size: int, crossings: int, batch: int, player: str, s
     return steps / (time.process_time() - started)
 
 
-__all__ = ["SpeedRow", "benchmark"]
+@dataclass(frozen=True)
+class StartRow:
+    """What a fresh process needs, beside the limit that it is held to."""
+
+    what: str
+    figure: float
+    unit: str
+    limit: float
+
+
+_BEGIN = """
+import resource, numpy, gymnasium, domains
+environment = gymnasium.make_vec("nesy/PersonFollowing-v0", num_envs={batch}, vectorization_mode="vector_entry_point")
+environment.reset(seed=0)
+for step in range({steps}):
+    environment.step(numpy.full({batch}, step % 4))
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
+def starts() -> list[dict[str, Any]]:
+    """Rows of `StartRow` as dicts: import, first steps with and without cached kernels, memory of a large batch.
+
+    Each is a process of its own; times are of the processor, user and system together.
+    """
+    with tempfile.TemporaryDirectory() as cache:
+        cold, _ = _spent(_BEGIN.format(batch=1024, steps=3), cache)
+        warm, _ = _spent(_BEGIN.format(batch=1024, steps=3), cache)
+        imported, _ = _spent("import domains, gymnasium; gymnasium.make('nesy/PersonFollowing-v0')", cache)
+        _, kilobytes = _spent(_BEGIN.format(batch=16384, steps=50), cache)
+    rows = (
+        StartRow("cold start: kernels compiled, batch 1024, reset and 3 steps", cold, "s", 15.0),
+        StartRow("warm start: kernels cached, batch 1024, reset and 3 steps", warm, "s", 1.5),
+        StartRow("import and make", imported, "s", 1.5),
+        StartRow("memory of batch 16,384 after 50 steps", int(kilobytes) / 1024**2, "GiB", 2.0),
+    )
+    return [asdict(row) for row in rows]
+
+
+def _spent(program: str, cache: str) -> tuple[float, str]:
+    """Seconds of processor time of a program in a process of its own, and what it printed."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    environment = os.environ | {"NUMBA_CACHE_DIR": cache}
+    done = subprocess.run([sys.executable, "-c", program], env=environment, check=True, capture_output=True, text=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime, done.stdout.strip()
+
+
+__all__ = ["SpeedRow", "StartRow", "benchmark", "starts"]

@@ -8,11 +8,11 @@ NEEDS: tuple[str, ...] = ()
 
 
 def measure(settings: Settings) -> list[Row]:
-    """Steps per second by size, batch and player."""
-    from domains.person_following.speed import benchmark
+    """Steps per second by size, batch and player; then what a fresh process needs, beside the limits for it."""
+    from domains.person_following.speed import benchmark, starts
 
     rows = benchmark(seconds=settings.seconds, seed=settings.seed)
-    return [
+    speeds = [
         Row(
             what=f"{row['what']}, size {row['size']}, {row['num_crossings']} crossings, batch {row['batch']}, "
             f"{row['player']} play",
@@ -23,3 +23,14 @@ def measure(settings: Settings) -> list[Row]:
         )
         for row in rows
     ]
+    needs = [
+        Row(
+            row["what"],
+            row["figure"],
+            row["unit"],
+            f"limit {row['limit']:g} {row['unit']}",
+            row["limit"] / row["figure"],
+        )
+        for row in starts()
+    ]
+    return speeds + needs
