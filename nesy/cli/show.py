@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 class Arguments:
     """Options of `nesy show`."""
 
-    what: Annotated[Literal["dbn", "fidelity"], tyro.conf.Positional] = "dbn"
-    """What to show: the model, or the report of how far it can be trusted."""
+    what: Annotated[Literal["dbn", "fidelity", "figure3"], tyro.conf.Positional] = "dbn"
+    """What to show: the model, the report of how far it can be trusted, or figure 3 of the paper (with --to)."""
     run: Path = Path("runs/default")
     """The run folder."""
     factor: int | None = None
@@ -40,6 +40,8 @@ class Arguments:
 def run(options: Arguments) -> dict[str, Any]:
     """Print the table; draw the picture where --to is given."""
     folder = RunFolder.open(options.run)
+    if options.what == "figure3":
+        return _figure3(folder, options)
     folder.require("extract")
     if options.what == "fidelity":
         return _fidelity(folder, options)
@@ -64,6 +66,19 @@ def run(options: Arguments) -> dict[str, Any]:
             draw_factor(dbn, Codebook.load(folder.dbn), factor, options.to, action)
         result["drawn"] = str(options.to)
     return result
+
+
+def _figure3(folder: RunFolder, options: Arguments) -> dict[str, Any]:
+    if options.to is None or options.to.suffix not in (".png", ".svg"):
+        raise UserError("figure3: name the picture, .png or .svg, with --to")
+    folder.require("train")
+    from nesy.report import figure3
+    from nesy.run_folder import atomic_path
+
+    figure = figure3.draw(figure3.moments(folder, count=6))
+    with atomic_path(options.to) as temporary:
+        figure.savefig(temporary, dpi=110)
+    return {"drawn": str(options.to)}
 
 
 def _trees(dbn: TwoSliceDBN, factor: int | None, action: int | None, tolerance: float) -> str:
