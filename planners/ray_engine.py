@@ -65,16 +65,12 @@ def run_on_ray(jobs_of: list[CellJob], task: Task, address: str | None = None) -
                 job = running.pop(reference)
                 try:
                     left = ray.get(reference)
-                except (
-                    ray.exceptions.WorkerCrashedError,
-                    ray.exceptions.NodeDiedError,
-                    ray.exceptions.ObjectLostError,
-                ):
-                    begin(job)
-                    continue
-                except ray.exceptions.RayTaskError as error:
+                except ray.exceptions.RayTaskError as error:  # the cell itself went wrong
                     cause = error.as_instanceof_cause()
                     raise (UserError(str(error.cause)) if isinstance(cause, UserError) else cause) from None
+                except ray.exceptions.RayError:  # its worker or node is gone
+                    begin(job)
+                    continue
                 _unpack(left, job[1])
 
 

@@ -3,8 +3,8 @@
 episodes (all seeds pooled) -> records (means, interquartile means, intervals, regret, share of the optimum)
                             -> comparison.parquet .csv .md .tex, regret.parquet .csv, statistics.json, plots
 
-Intervals: stratified by map, since every agent meets the same maps; for agents that learn, with three seeds or more,
-over seeds, since the episodes of one training have that training in common.
+Intervals: stratified by map where maps come more than once, since every agent meets the same ones; for agents that
+learn, with three seeds or more, over seeds, since the episodes of one training have that training in common.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from nesy.run_folder import atomic_path, read_json, write_json
 from planners.config import ORACLES, CompareConfig
 from planners.statistics import (
     Interval,
+    bootstrap,
     interquartile_mean,
     over_seeds,
     performance_profile,
@@ -100,6 +101,8 @@ def _interval(values: np.ndarray, rows: dict[str, np.ndarray], config: CompareCo
     if rows["experience_steps"].max() > 0 and len(np.unique(seeds)) >= 3 and not robust:
         return over_seeds(values, seeds, 0, config.confidence)
     statistic = interquartile_mean if robust else np.mean
+    if np.unique(rows["map_id"], return_counts=True)[1].min() < 2:  # nothing to resample within a map
+        return bootstrap(values, 0, config.confidence, statistic)
     return stratified_bootstrap(values, rows["map_id"], 0, config.confidence, statistic)
 
 

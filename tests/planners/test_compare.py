@@ -20,9 +20,7 @@ REFERENCES = CompareConfig(agents=("greedy-follower", "random", "greedy-last-see
 @pytest.fixture(autouse=True)
 def _no_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
     """The exact optimum takes seconds and has tests of its own."""
-    monkeypatch.setattr(
-        "planners.results.map_optimum", lambda *_: {"mean_return": 90.0, "success": 0.8, "maps": []}
-    )
+    monkeypatch.setattr("planners.results.map_optimum", lambda *_: {"mean_return": 90.0, "success": 0.8, "maps": []})
 
 
 def _rows(run: RunFolder) -> dict[str, list[object]]:
@@ -82,3 +80,50 @@ def test_grid_has_every_cell_once() -> None:
     )
     cells = grid(config)
     assert len(cells) == len({cell.name for cell in cells}) == 2 * 2 * 2 + 2 * 2 + 2
+
+
+def test_rules_hold_for_every_agent_and_policies_come_from_files(tiny_run: Path, tmp_path: Path) -> None:
+    run = RunFolder(tmp_path / "run")
+    run.path.mkdir()
+    run.world_model.symlink_to((tiny_run / "world_model").resolve())
+    rules = tmp_path / "still.lp"
+    rules.write_text("forbidden(forward). forbidden(left) :- now(wall_ahead).\n")
+    policy = next((tiny_run / "policies").glob("*.safetensors"))
+    config = CompareConfig(
+        agents=("greedy-follower", "random"), episodes=42, rules=(str(rules),), policies=(str(policy),)
+    )
+    records = compare(run, config)
+    rows = _rows(run)
+    assert len(records) == 3
+    assert records[2]["agent"] == f"file {policy.stem}"
+    assert set(rows["path_length"]) == {0.0}
+    before = rows["return"]
+    rules.write_text("forbidden(stay).\n")
+    compare(run, config)
+    assert _rows(run)["return"] != before  # other rules, other results, under the same file name
+    with pytest.raises(UserError, match=r"none\.lp: not readable"):
+        compare(run, CompareConfig(agents=("random",), rules=(str(tmp_path / "none.lp"),)))
+
+
+def test_every_metric_is_a_column_and_every_table_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = RunFolder(tmp_path)
+    domain = load_domain()
+    seen = evaluate(domain, "paper", Player(OracleFollower()), 42, EVALUATION_SEED)
+    maps = [{"map_id": int(name), "return": 100.0, "success": 1.0} for name in seen["map_id"]]
+    monkeypatch.setattr("planners.results.map_optimum", lambda *_: {"mean_return": 100.0, "success": 1.0, "maps": maps})
+    (record,) = compare(run, CompareConfig(agents=("greedy-follower",), episodes=84))
+    columns = pq.read_table(run.results / "episodes.parquet").column_names
+    assert {"spl", "psc", "recovery_time", "person_delay", "experience_steps", "ms_per_decision"} <= set(columns)
+    assert record["regret"]["mean"] == pytest.approx(100 - record["return"]["mean"])
+    assert record["interquartile_mean"]["mean"] > record["return"]["mean"]  # a fifth of the maps is out of reach
+    assert record["metrics"]["success"] == pytest.approx(record["success"]["mean"])
+    regret = pq.read_table(run.results / "regret.parquet").to_pydict()
+    assert len(set(regret["map_id"])) == 42
+    assert set(regret["episodes"]) == {2}
+    for name in ("comparison.csv", "comparison.md", "comparison.tex", "regret.csv", "statistics.json"):
+        assert (run.results / name).stat().st_size > 0
+    assert r"100 \%" not in (run.results / "comparison.tex").read_text()
+    assert r"\%" in (run.results / "comparison.tex").read_text()
+    for name in ("returns", "profiles"):
+        assert (run.results / "plots" / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
+        assert "<svg" in (run.results / "plots" / f"{name}.svg").read_text()

@@ -6,6 +6,7 @@ import pytest
 from planners.statistics import (
     bootstrap,
     interquartile_mean,
+    over_seeds,
     performance_profile,
     probability_of_improvement,
     running_average,
@@ -53,3 +54,20 @@ def test_running_averages_by_hand() -> None:
     values = np.array([1.0, 3.0, 5.0, 7.0])
     assert running_average(values).tolist() == [1.0, 2.0, 3.0, 4.0]
     assert running_average(values, 2).tolist() == [1.0, 2.0, 4.0, 6.0]
+
+
+def test_improvement_counts_as_the_rank_test_does() -> None:
+    from scipy import stats
+
+    rng = np.random.default_rng(4)
+    ours, theirs = rng.integers(0, 6, 30).astype(float), rng.integers(0, 6, 20).astype(float)
+    expected = stats.mannwhitneyu(ours, theirs, alternative="greater").statistic / 600
+    assert probability_of_improvement(ours, theirs, seed=0).mean == pytest.approx(expected)
+
+
+def test_the_interval_over_seeds_is_that_of_their_means() -> None:
+    seeds = np.repeat(np.arange(5), 100)
+    values = np.random.default_rng(3).normal(0, 1, 500) + 10.0 * seeds
+    between, pooled = over_seeds(values, seeds, 0), bootstrap(values, 0)
+    assert between.mean == pytest.approx(pooled.mean)
+    assert between.high - between.low > 3 * (pooled.high - pooled.low)
