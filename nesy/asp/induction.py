@@ -87,7 +87,9 @@ def _best_cut(
     left_open = _entropy(found, inside) + _entropy(hits - found, views - inside)
     left_open[(inside < min_leaf) | (views - inside < min_leaf)] = np.inf
     column, last = np.unravel_index(int(np.round(left_open, 9).argmin()), left_open.shape)
-    if not left_open[column, last] < _entropy(np.array([hits]), np.array([views]))[0] - 1e-9:
+    before = _entropy(np.array([hits]), np.array([views]))[0]
+    # a cut that tells nothing by itself may be the first of two that do: an exact tree takes it
+    if not left_open[column, last] < (before - 1e-9 if min_leaf > 1 else np.inf):
         return None
     chosen = np.zeros(total.shape[1], dtype=bool)
     chosen[order[column, : last + 1]] = True
