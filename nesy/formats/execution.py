@@ -44,7 +44,8 @@ def by_fast_downward(
         UserError: Fast Downward is not installed.
     """
     driver = _driver()
-    inside = {tuple(code) for code in pddl.reachable_codes(dbn, start, pddl.known_codes(dbn), outcomes).tolist()}
+    codes = pddl.reachable_codes(dbn, start, pddl.known_codes(dbn), outcomes, goals)
+    inside = {tuple(code) for code in codes.tolist()}
     wanted = np.array([goal for goal in goals.tolist() if tuple(goal) in inside])
     if not len(wanted):
         return None
@@ -58,7 +59,6 @@ def by_fast_downward(
             capture_output=True,
         )
         steps = (Path(folder) / "plan.txt").read_text().splitlines()
-        codes = pddl.reachable_codes(dbn, start, pddl.known_codes(dbn), outcomes)
     plan = []
     for step in steps:
         action = pddl.action_of(dbn, step) if step.startswith("(") else None
@@ -110,7 +110,7 @@ def execute(
     episodes: int,
     seed: int,
     longest: int = 60,
-    outcomes: int = 4,
+    outcomes: int = 2,
 ) -> Executed:
     """Drive to the goal of the crossing task by plans of Fast Downward, planning again on every surprise.
 

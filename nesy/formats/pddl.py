@@ -42,7 +42,8 @@ def write(
         path: the domain's file.
         start: integers [N]: the initial code; by default each factor's most probable initial value.
         goals: integers [G, N]: codes of which one is to be reached; without it the problem has no goal.
-        reachable: write only the codes that can be met from the start if every outcome is the most probable one.
+        reachable: write only the codes that the outcomes lead to from the start; with `goals`, in as many steps as
+            the nearest of them takes, and one more.
         goal: {factor: value}: the goal as values of some factors, in place of `goals`.
         outcomes: how many outcomes of a step are written, the most probable first; further ones only from a
             probability of `LEAST` on.
@@ -53,7 +54,7 @@ def write(
     codes = known_codes(dbn)
     code = dbn.initial.argmax(axis=1) if start is None else np.asarray(start)
     if reachable:
-        codes = reachable_codes(dbn, code, codes, outcomes)
+        codes = reachable_codes(dbn, code, codes, outcomes, goals)
     with atomic_path(path) as temporary:
         temporary.write_text(_domain(dbn, codes, goals, outcomes), encoding="utf-8")
     with atomic_path(path.with_name(f"{path.stem}_problem{path.suffix}")) as temporary:
@@ -73,15 +74,22 @@ def known_codes(dbn: TwoSliceDBN) -> np.ndarray:
     return np.array(list(np.ndindex(*(dbn.num_values,) * dbn.num_factors)))
 
 
-def reachable_codes(dbn: TwoSliceDBN, start: np.ndarray, known: np.ndarray, outcomes: int = 1) -> np.ndarray:
-    """The known codes that the outcomes lead to from a start, integers [M, N]; the start among them."""
+def reachable_codes(
+    dbn: TwoSliceDBN, start: np.ndarray, known: np.ndarray, outcomes: int = 1, goals: np.ndarray | None = None
+) -> np.ndarray:
+    """The known codes that the outcomes lead to from a start, integers [M, N], in order; the start among them.
+
+    With goals, integers [G, N], only those met in as many steps as the nearest goal takes, and one more.
+    """
     allowed = {tuple(code) for code in known.tolist()}
+    wanted = set() if goals is None else {tuple(code) for code in np.asarray(goals).tolist()}
     found = {tuple(int(v) for v in start)}
-    front = list(found)
-    while front:
+    front, left = list(found), -1
+    while front and left != 0:
         now = np.array(front)
         later = {code for a in range(dbn.num_actions) for _, code, _ in _outcomes(dbn, now, a, outcomes)}
         front = sorted((later & allowed) - found)
+        left = left - 1 if left > 0 else 1 if found & wanted or set(front) & wanted else -1
         found |= set(front)
     return np.array(sorted(found))
 
