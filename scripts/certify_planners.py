@@ -95,7 +95,7 @@ def certify(problem: str, episodes: int, seconds: float, solver_seconds: float) 
     search = TreeSearch(
         model,
         np.random.default_rng(0),
-        simulations=20_000 if large else 200,
+        simulations=5000 if large else 200,
         time_limit=seconds if large else 0.0,
         trials=200 if large else 20,
         reuse=not mark.exact,
