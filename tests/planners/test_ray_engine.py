@@ -1,0 +1,70 @@
+"""The engine `ray`: the same results on two nodes, one of which dies on the way."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from nesy.run_folder import RunFolder
+from planners.compare import compare
+from tests.planners.test_engines import LEARNERS, rows
+
+pytestmark = pytest.mark.ray
+SLOWER = replace(LEARNERS, dqn=replace(LEARNERS.dqn, episodes=250), seeds=(0, 1))
+
+
+@pytest.fixture(autouse=True)
+def _no_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("planners.results.map_optimum", lambda *_: None)
+
+
+def test_two_nodes_one_of_which_is_killed(tiny_run: Path, tmp_path: Path) -> None:
+    ray: Any = pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    alone, clustered = RunFolder(tmp_path / "alone"), RunFolder(tmp_path / "clustered")
+    for run in (alone, clustered):
+        run.path.mkdir()
+        run.world_model.symlink_to((tiny_run / "world_model").resolve())
+    compare(alone, SLOWER, jobs=1)
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    try:
+        doomed = cluster.add_node(num_cpus=1)
+        ray.init(address=cluster.address, log_to_driver=False, logging_level="error")
+
+        class Watching:
+            """Progress that kills the second node once it has surely been given a cell and has begun it."""
+
+            done, killer = 0, None
+
+            def task(self, description: str, total: int) -> Any:
+                import contextlib
+
+                return contextlib.nullcontext(self)
+
+            def advance(self, steps: int = 1, **metrics: float) -> None:
+                self.done += steps
+                if self.killer is None:
+                    self.killer = threading.Thread(target=self.kill)
+                    self.killer.start()
+
+            def kill(self) -> None:
+                time.sleep(0.5)
+                cluster.remove_node(doomed, allow_graceful=False)
+
+        watching = Watching()
+        compare(clustered, SLOWER, engine="ray", progress=watching)
+        assert watching.killer is not None
+        watching.killer.join()
+        assert sum(node["Alive"] for node in ray.nodes()) == 1
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
+    assert rows(alone) == rows(clustered)
+    for path in alone.policies.glob("*.safetensors"):
+        assert path.read_bytes() == (clustered.policies / path.name).read_bytes()
