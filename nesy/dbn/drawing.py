@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -94,7 +94,8 @@ def draw_factor(
         raise UserError(f"no action {action}; the actions are {', '.join(dbn.action_names)}")
     actions = range(dbn.num_actions) if action is None else (action,)
     figure = Figure(figsize=(max(1.6 * dbn.num_values, 3.4 * len(actions)), 6.4), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=(2.6, 3.8))
+    halves: Any = figure.subfigures(2, 1, height_ratios=(2.6, 3.8))
+    above, below = halves
     for value, axis in enumerate(above.subplots(1, dbn.num_values, squeeze=False)[0]):
         _value(dbn, codebook, factor, value, axis)
     above.suptitle(f"Values of {dbn.factor_names[factor]}", fontsize=10)
