@@ -43,9 +43,10 @@ def make(run: RunFolder, summary: dict[str, Any]) -> str:
     )
     lines = describe(dbn, factor=dbn.order[0], action=action).splitlines()
     excerpt = "\n".join(lines[:40]) + ("\n..." if len(lines) > 40 else "")
+    own = {name: value for name, value in summary["dbn"].items() if name != "fidelity"}
     command = f"nesy extract --run {run.path} --table --factor {dbn.order[0]} --action {dbn.action_names[action]}"
     return (
-        figures_table(summary["dbn"], "Figures of the extraction")
+        figures_table(own, "Figures of the extraction")
         + graph
         + parents
         + f"<p>An excerpt; all of it: <code>{html.escape(command)}</code></p><pre>{html.escape(excerpt)}</pre>"
