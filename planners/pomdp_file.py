@@ -23,6 +23,7 @@ from planners.pomdp import TabularPOMDP
 _KEYWORDS = ("discount", "values", "states", "actions", "observations", "start", "T", "O", "R")
 _ROUNDING = 1e-3  # how far a row may be from summing to 1
 _LARGEST = 50_000_000  # entries of a table that a file may name at once
+_MOST_NAMES = 1_000_000  # states, actions or observations that a file may count up
 RewardEntry = tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None, np.ndarray]
 
 
@@ -176,7 +177,7 @@ class _Reader:
             while self.at < len(self.tokens) and not self.at_keyword():
                 words.append(self.take())
             if len(words) == 1 and words[0].isdecimal():
-                if int(words[0]) > _LARGEST:
+                if int(words[0]) > _MOST_NAMES:
                     raise self.fail(f"{words[0]} {keyword} are too many")
                 words = [str(i) for i in range(int(words[0]))]
             if len(set(words)) != len(words):

@@ -77,6 +77,9 @@ class TreeSearch:
         method: see the module's head.
         trials: searches of the offline solver whose bounds the method `bounds` starts from.
         reuse: whether the tree below what happened is kept by `update`.
+
+    Raises:
+        ValueError: a discount of 1.
     """
 
     def __init__(
@@ -92,6 +95,8 @@ class TreeSearch:
         trials: int = 20,
         reuse: bool = True,
     ) -> None:
+        if not model.discount < 1:
+            raise ValueError("the search needs a discount below 1")
         self.model, self.method, self.reuse = model, method, reuse
         self.simulations, self.depth, self.time_limit = simulations, depth, time_limit
         self._planted: np.ndarray | None = None  # the belief that the tree at hand was grown for
