@@ -151,7 +151,7 @@ def test_words_and_wildcards_for_rows(tmp_path: Path) -> None:
         "R: * : * : * : * 1\nR: go : b : c : y 7\nR: back : a : * : * -2\nR: back : c : a\n3 6\n"
     )
     model = TabularPOMDP.from_file(path)
-    assert np.allclose(model.transition[0].toarray(), [[0, 1, 0], [1 / 3, 1 / 3, 1 / 3], [0, 0, 1]])
+    assert np.allclose(model.transition[0].toarray(), np.array([[0, 1, 0], [1 / 3, 1 / 3, 1 / 3], [0, 0, 1]]))
     assert np.allclose(model.transition[1].toarray(), [[1, 0, 0]] * 3)
     assert np.allclose(model.observation.sum(axis=2), 1.0)
     assert model.observation[0, 2].tolist() == [0.5, 0.5]
