@@ -6,6 +6,7 @@ predicates on every view, all that a question about meaning needs: no network an
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -168,6 +169,30 @@ def value_meanings(codebook: Codebook, num_values: int, most: int = 3) -> tuple[
         tuple(_meaning(codebook, codebook.codes[:, factor] == value, base, most) for value in range(num_values))
         for factor in range(codebook.codes.shape[1])
     )
+
+
+def named_meanings(
+    meanings: tuple[tuple[str, ...], ...], readability: Mapping[str, Any]
+) -> tuple[tuple[str, ...], ...]:
+    """The meanings, with those of factors that were made to answer questions said by their answers.
+
+    Args:
+        meanings: [N][K] texts, as `value_meanings` finds them.
+        readability: readability.json of a world model; `named`: {factor: {questions, answers: {value: [bool]}}}.
+
+    Raises:
+        UserError: it is damaged.
+    """
+    result = [list(texts) for texts in meanings]
+    try:
+        for factor, named in dict(readability.get("named") or {}).items():
+            for value, answers in named["answers"].items():
+                if result[int(factor)][int(value)] != "not met":
+                    told = zip(named["questions"], answers, strict=True)
+                    result[int(factor)][int(value)] = ", ".join(str(q) if yes else f"not {q}" for q, yes in told)
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        raise UserError(f"readability.json does not say what values of factors mean ({error!r}); train again") from None
+    return tuple(tuple(texts) for texts in result)
 
 
 def _meaning(codebook: Codebook, chosen: np.ndarray, base: np.ndarray, most: int) -> str:

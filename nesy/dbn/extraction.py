@@ -17,10 +17,11 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 
 from nesy.config import ExtractConfig
-from nesy.dbn.codebook import Codebook, distinct_views, value_meanings
+from nesy.dbn.codebook import Codebook, distinct_views, named_meanings, value_meanings
 from nesy.dbn.model import Parents, TwoSliceDBN
 from nesy.dbn.rows import unique_rows
 from nesy.errors import UserError
+from nesy.run_folder import read_json
 
 if TYPE_CHECKING:
     from nesy.run_folder import RunFolder
@@ -184,7 +185,7 @@ def extract_run(run: RunFolder, domain_name: str, config: ExtractConfig | None =
     described: dict[str, Any] = {
         "action_names": domain.spec.action_names,
         "initial_codes": transitions.codes[started] if started.any() else None,
-        "meanings": value_meanings(codebook, int(model.num_values)),
+        "meanings": _meanings(run, codebook, int(model.num_values)),
         "provenance": {
             "source": config.source,
             "domain": domain_name,
@@ -240,11 +241,14 @@ def _fitted(
     )
 
 
+def _meanings(run: RunFolder, codebook: Codebook, num_values: int) -> tuple[tuple[str, ...], ...]:
+    meanings, path = value_meanings(codebook, num_values), run.world_model / "readability.json"
+    return named_meanings(meanings, read_json(path)) if path.is_file() else meanings
+
+
 def _seed(run: RunFolder) -> int | None:
     if not run.config.is_file():
         return None
-    from nesy.run_folder import read_json
-
     return int(read_json(run.config).get("seed", 0))
 
 

@@ -98,3 +98,15 @@ def test_thumbnails_show_walls_goal_and_viewer():
 def test_shares_of_arcs():
     found = Recovery(right=3, found=4, true=6)
     assert found.precision == 0.75 and found.recall == 0.5
+
+
+def test_values_of_named_factors_are_said_by_their_answers():
+    from nesy.dbn.codebook import named_meanings
+
+    found = (("a", "not met"), ("b", "c"))
+    named = {"named": {"0": {"questions": ["wall", "goal"], "answers": {"0": [True, False], "1": [True, True]}}}}
+    assert named_meanings(found, named) == (("wall, not goal", "not met"), ("b", "c"))
+    assert named_meanings(found, {}) == found
+    for damaged in ({"9": named["named"]["0"]}, {"0": {"questions": ["x"], "answers": {"0": [True, False]}}}, {"0": 3}):
+        with pytest.raises(UserError, match=r"readability\.json"):
+            named_meanings(found, {"named": damaged})
