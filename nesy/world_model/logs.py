@@ -7,6 +7,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from nesy.report.text import flat
 from nesy.run_folder import atomic_path
 
 
@@ -33,7 +34,7 @@ class MetricsLog:
         """Append the figures of epoch `tick`, counted from 1."""
         self._stream.write(json.dumps({"tick": tick, **figures}) + "\n")
         self._stream.flush()
-        for name, value in figures.items():
+        for name, value in flat(figures):
             if isinstance(value, int | float):
                 self._writer.add_scalar(f"{figures['stage']}/{name}", value, tick)
 

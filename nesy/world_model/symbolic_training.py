@@ -282,7 +282,7 @@ class SymbolicTrainer:
         target = self.held_out if held_out and self.held_out is not None else self.final
         figures = view_gates(SymbolicCodec(self.model), target.views)
         self.model.train()
-        return {name: figures[name] for name in ("views_exact", "cells", "distinct_codes", "distinct_views")}
+        return figures
 
     def _measure_held_out(self) -> None:
         if self.held_out is None:

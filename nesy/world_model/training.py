@@ -26,6 +26,7 @@ from nesy.world_model.codec import SymbolicCodec
 from nesy.world_model.columns import Columns
 from nesy.world_model.distinct import Transitions, reference_transitions, with_mirror
 from nesy.world_model.gates import evaluate
+from nesy.world_model.guided_gates import guided_gates
 from nesy.world_model.imagination import imagined_rollouts
 from nesy.world_model.logs import MetricsLog
 from nesy.world_model.paper_training import PaperTrainer
@@ -116,6 +117,11 @@ def _train(
         started = time.monotonic() - elapsed
         while not trainer.finished:
             figures = trainer.tick(time.monotonic() - started)
+            if isinstance(trainer, SymbolicTrainer) and figures["stage"] == "network" and held_out is not None:
+                rng = np.random.default_rng(seed)
+                now = SymbolicCodec(trainer.model)
+                figures |= guided_gates(now, trainer.guide, held_out, columns, apart, rng)
+                trainer.model.train()
             tick += 1
             elapsed = time.monotonic() - started
             log.write(tick, {**figures, "seconds": round(elapsed, 3)})

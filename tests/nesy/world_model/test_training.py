@@ -113,6 +113,24 @@ def test_another_seed_or_setting_starts_anew(tmp_path: Path, toy, trained: Path)
     assert not all(torch.equal(before[name], weights(folder)[name]) for name in before if "0.weight" in name)
 
 
+GATES = {
+    "views_exact", "cells", "distinct_codes", "distinct_views", "values_used", "perplexity", "next_code_nll",
+    "next_view_exact", "next_view_cells", "inverse_accuracy", "rollouts",
+}  # fmt: skip
+
+
+def test_every_epoch_of_the_network_has_all_gates_on_held_out_maps(trained: Path) -> None:
+    lines = [json.loads(line) for line in (trained / "metrics.jsonl").read_text().splitlines()]
+    held_out = json.loads((trained / "config.json").read_text())["metrics"]["held_out"]
+    epochs = [line for line in lines if line["stage"] == "network"]
+    assert len(epochs) == SMALL.epochs
+    for line in epochs:
+        assert set(line) >= GATES
+        assert line["distinct_views"] == held_out["distinct_views"]
+        assert 0 <= line["next_view_exact"] <= line["next_view_cells"] <= 1
+    assert epochs[-1]["next_code_nll"] < epochs[0]["next_code_nll"]
+
+
 def test_held_out_figures_are_of_maps_not_learned_from(trained: Path) -> None:
     metrics = json.loads((trained / "config.json").read_text())["metrics"]
     held_out = metrics["held_out"]
