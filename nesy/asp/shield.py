@@ -103,6 +103,9 @@ class Shield:
             for atom in self._control.symbolic_atoms.by_signature(name, arity)
             if atom.is_external
         ]
+        # externals are free while assumptions fix every one of them
+        for literal, _ in self._inputs:
+            self._control.assign_external(literal, None)
         self._memory: dict[tuple[object, ...], Advice] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -199,10 +202,7 @@ class Shield:
             cell, heading = divmod(configuration - 1, 4)
             x, y = divmod(cell, self.view_size)
             true.add(clingo.Function("person", [clingo.Number(x), clingo.Number(y), clingo.Number(heading)]))
-        # externals are free while assumptions fix every one of them
         assumptions = [literal if symbol in true else -literal for literal, symbol in self._inputs]
-        for literal, _ in self._inputs:
-            self._control.assign_external(literal, None)
         shown: list[clingo.Symbol] = []
         result = self._control.solve(
             assumptions=assumptions, on_model=lambda model: shown.extend(model.symbols(shown=True))

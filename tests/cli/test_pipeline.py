@@ -203,3 +203,18 @@ def test_a_damaged_file_gives_one_line(
     capsys.readouterr()
     assert main([*command.split(), "--run", str(copy)]) == 2
     assert path.name in _error(capsys)
+
+
+def test_an_agent_s_choice_is_explained(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rules = tmp_path / "rules.lp"
+    rules.write_text("forbidden(A) :- action(A), A != stay.\n")
+    question = ["query", "--run", str(run), "--start", "0", "--person", "0,2,1", "--json"]
+    for agent in ("dqn-full-perspective-shift", "search-full-perspective-shift"):
+        capsys.readouterr()
+        assert main([*question, "--why", agent]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert found["agent"].startswith(agent) and found["values"][found["action"]] == max(found["values"].values())
+        assert f"chooses '{found['action']}'" in found["text"] and found["support"]
+        assert main([*question, "--why", agent, "--rules", str(rules)]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert found["action"] == "stay" and set(found["because"]) == {"left", "right", "forward"}

@@ -5,4 +5,4 @@ must hold, of `nesy.run_folder.STEPS`; empty where no run is needed) and `measur
 `settings` is a `measuring.Settings`. To add one, write the module and name it here.
 """
 
-SUITES: tuple[str, ...] = ("env", "model", "dbn", "planner", "dqn")
+SUITES: tuple[str, ...] = ("env", "model", "dbn", "planner", "dqn", "asp")
