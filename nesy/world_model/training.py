@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -74,13 +75,17 @@ def train(
     """
     folder = Path(folder)
     _check(config)
-    threads = torch.get_num_threads()
+    threads, exact = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
     torch.set_num_threads(1)  # small networks: one thread is as fast, and sums are in the same order everywhere
+    if torch.device(config.device).type == "cuda":
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # or matrix products may differ from run to run
+        torch.use_deterministic_algorithms(True)
     try:
         columns = Columns.of(experience) if isinstance(experience, Experience) else Columns.mapped(experience, folder)
         return _train(columns, config, folder, seed, progress, domain, variant)
     finally:
         torch.set_num_threads(threads)
+        torch.use_deterministic_algorithms(exact)
 
 
 def _train(
