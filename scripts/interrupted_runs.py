@@ -117,8 +117,8 @@ def _counts(path: Path, root: Path) -> bool:
 def _content(path: Path) -> Any:
     """What a file says, without times: tables as columns, JSON as values, others as bytes."""
     if path.suffix == ".parquet":
-        table = pq.read_table(path)
-        return {name: table[name].to_pylist() for name in table.column_names if name not in TIMES}
+        table = pq.ParquetFile(path).read()
+        return table.drop_columns([name for name in table.column_names if name in TIMES]).replace_schema_metadata(None)
     if path.suffix == ".json":
         return _timeless(json.loads(path.read_text()))
     if path.suffix == ".jsonl":
