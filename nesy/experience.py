@@ -299,7 +299,8 @@ def _read_part(path: Path, sources: set[str] | None, names: Sequence[str]) -> di
         with path.open("rb") as stream:
             file = pq.ParquetFile(stream)
             side = _checked_side(path, file.schema_arrow)
-            table = file.read(columns=list(dict.fromkeys([*names, *(() if sources is None else ("source",))])))
+            stored = ["source" if name == "source_number" else name for name in names]
+            table = file.read(columns=list(dict.fromkeys([*stored, *(() if sources is None else ("source",))])))
     except (OSError, ValueError, pa.ArrowException) as error:
         raise _damaged(path, error) from None
     source, number = np.zeros(0, dtype="U20"), np.zeros(0, dtype=np.int8)
