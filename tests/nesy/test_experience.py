@@ -6,7 +6,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from nesy.errors import UserError
-from nesy.experience import COLUMNS, Experience, count_rows, write_part
+from nesy.experience import COLUMNS, SOURCES, Experience, count_rows, load_columns, write_part
 
 
 def columns(rows: int, rng: np.random.Generator, source: str = "crossing-random") -> dict[str, np.ndarray]:
@@ -105,3 +105,15 @@ def test_flipped_bytes_never_pass_unnoticed_as_a_crash(tmp_path: Path) -> None:
             Experience.load(tmp_path)
         except UserError as error:
             assert "part-00000.parquet" in str(error)
+
+
+def test_some_columns_alone_are_those_of_all(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    write_part(tmp_path / "part-00000.parquet", columns(7, rng))
+    write_part(tmp_path / "part-00001.parquet", columns(5, rng, "following-mixture"))
+    everything = Experience.load(tmp_path)
+    some = load_columns(tmp_path, ("view", "action", "source_number"))
+    assert list(some) == ["view", "action", "source_number"]
+    np.testing.assert_array_equal(some["view"], everything.view)
+    np.testing.assert_array_equal(np.array(SOURCES)[some["source_number"]], everything.source)
+    assert len(load_columns(tmp_path, ("action",), ("following-mixture",))["action"]) == 5
