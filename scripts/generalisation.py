@@ -32,10 +32,12 @@ class Arguments:
     """Variant of person following."""
     test_share: float = 0.2
     """Share of the maps that is only tested on."""
+    most_maps: int = 5000
+    """Most maps to learn from; what was met on further ones is left out."""
     seed: int = 0
     """Seed of everything random."""
     collect: CollectConfig = field(
-        default_factory=lambda: CollectConfig(crossing_episodes=3000, following_episodes=2000)
+        default_factory=lambda: CollectConfig(crossing_episodes=5000, following_episodes=3200)
     )
     """Experience."""
     train: TrainConfig = field(default_factory=lambda: TrainConfig(held_out=0.0, time_limit=0.0))
@@ -49,7 +51,8 @@ def main(arguments: Arguments) -> None:
     collect(load_domain(), arguments.collect, folder, seed, progress, variant=arguments.variant)
     experience = Experience.load(folder)
     apart = experience.held_out_maps(arguments.test_share, np.random.default_rng(seed))
-    learned, tested = experience.select(~apart), experience.select(apart)
+    maps = np.random.default_rng(seed).permutation(np.unique(experience.map_id[~apart]))[: arguments.most_maps]
+    learned, tested = experience.select(np.isin(experience.map_id, maps)), experience.select(apart)
     config = replace(arguments.train, held_out=0.0)
     train(learned, config, arguments.folder / "world_model", seed, progress)
     codec = SymbolicCodec(load_world_model(arguments.folder / "world_model"))

@@ -1,9 +1,10 @@
-"""Next-code NLL against the largest number of parents, with and without arcs inside slice t+1.
+"""Next-code NLL against the largest number of parents, with and without arcs inside slice t+1; or against readability.
 
-For every limit a code book is searched anew, named factors and completing ones, so that each limit has codes that
+For every row a code book is searched anew, named factors and completing ones, so that each row has codes that
 suit it, and the tables are counted and smoothed as in training. Prints a Markdown table.
 
     python scripts/parents_table.py --run runs/demo
+    python scripts/parents_table.py --run runs/demo --table named
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import tyro
@@ -24,6 +26,7 @@ from nesy.world_model.code_search import CodeSearch
 from nesy.world_model.distinct import transitions_of, view_keys, with_mirror
 from nesy.world_model.gates import limits
 from nesy.world_model.questions import Questions
+from nesy.world_model.readability import readability
 from nesy.world_model.refinement import CodeBook, Refiner
 from nesy.world_model.structure import Limits
 from nesy.world_model.symbolic_training import MOST_PARENTS
@@ -36,6 +39,8 @@ class Arguments:
 
     run: Path = Path("runs/default")
     """A run with experience."""
+    table: Literal["parents", "named"] = "parents"
+    """What changes from row to row: the largest number of parents, or the number of named factors."""
     epochs: int = 60
     """As in training: a sixth of them are rounds of questions, half of them rounds of the codes."""
     named_factors: int = 6
@@ -67,24 +72,30 @@ def main(arguments: Arguments) -> None:
     truth = domain.predicates.evaluate(transitions.views)
     questions = Questions.of(domain.predicates.names, truth, config.train.headline)
     print(f"limit of the data: {limits(reference)['next_code_nll']:.3f} nats (all maps, poses and actions)\n")
-    print("| parents from slice t | arcs inside t+1 | NLL, nats | counted NLL on the experience | rows | seconds |")
-    print("| --- | --- | --- | --- | --- | --- |")
-    for now in (1, 2, 3, 4):
-        for arcs in (0, 2):
-            rng = np.random.default_rng(arguments.seed)
-            began = time.perf_counter()
-            bounds = Limits(now=now, next=arcs, total=min(now + arcs, MOST_PARENTS), penalty=1.0)
-            refiner = Refiner(transitions, 8, 4, bounds)
-            search = CodeSearch(refiner, questions, 8, arguments.named_factors, config.train.headline)
-            search.start(rng.normal(size=(transitions.num_views, 8, 8)), rng)
-            book = search.search(max(3, round(arguments.epochs / 6)), max(4, round(arguments.epochs / 2)), rng)
-            count, _, _ = book.structure.arrays()
-            seconds = time.perf_counter() - began
-            print(
-                f"| {now} | {'at most 2' if arcs else 'none'} | {nll_on(book, transitions, reference):.3f} "
-                f"| {book.nll:.3f} | {int((8**count).sum()):,} | {seconds:.0f} |",
-                flush=True,
-            )
+    cases = [(now, arcs, arguments.named_factors) for now in (1, 2, 3, 4) for arcs in (0, 2)]
+    if arguments.table == "named":
+        cases = [(4, 2, named) for named in range(8)]
+    print(
+        "| parents from slice t | arcs inside t+1 | named factors | NLL, nats | counted NLL on the experience | rows "
+        "| factors per predicate | one factor | at most two | mutual information | seconds |"
+    )
+    print("| --- " * 11 + "|")
+    for now, arcs, named in cases:
+        rng = np.random.default_rng(arguments.seed)
+        began = time.perf_counter()
+        bounds = Limits(now=now, next=arcs, total=min(now + arcs, MOST_PARENTS), penalty=1.0)
+        search = CodeSearch(Refiner(transitions, 8, 4, bounds), questions, 8, named, config.train.headline)
+        search.start(rng.normal(size=(transitions.num_views, 8, 8)), rng)
+        book = search.search(max(3, round(arguments.epochs / 6)), max(4, round(arguments.epochs / 2)), rng)
+        count, _, _ = book.structure.arrays()
+        seconds = time.perf_counter() - began
+        read = readability(book.codes, truth, domain.predicates.names)
+        print(
+            f"| {now} | {'at most 2' if arcs else 'none'} | {named} | {nll_on(book, transitions, reference):.3f} "
+            f"| {book.nll:.3f} | {int((8**count).sum()):,} | {read['mean_factors']:.2f} | {100 * read['single']:.0f} % "
+            f"| {100 * read['pairs']:.0f} % | {read['mean_information']:.3f} | {seconds:.0f} |",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -16,9 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nesy.world_model.questions import GroupSearch, Questions, telling_cost
+from nesy.world_model.questions import GroupSearch, Questions
 from nesy.world_model.refinement import CodeBook, Refiner, separate
 from nesy.world_model.structure import Structure
+from nesy.world_model.telling import telling_cost
 
 NOISE = 12.0
 """Annealing temperature of the refinement at its start, in nats."""
