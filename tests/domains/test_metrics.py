@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import pairwise
 from pathlib import Path
 
@@ -16,6 +17,15 @@ from domains.person_following.metrics import BELIEF_METRICS, METRICS
 def test_every_metric_is_documented():
     text = Path("docs/metrics.md").read_text(encoding="utf-8")
     assert [name for name in (*METRICS, *BELIEF_METRICS) if f"`{name}`" not in text] == []
+
+
+def test_the_page_works_as_printed():
+    page = Path("docs/metrics.md").read_text(encoding="utf-8")
+    names: dict = {}
+    for block in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL):
+        exec(compile(block, "docs/metrics.md", "exec"), names)
+    assert set(METRICS) < set(names["metrics"])
+    assert len(names["metrics"]["spl"]) > 64
 
 
 def _record(env, player, steps, rng):
