@@ -121,8 +121,9 @@ def draw(columns: list[Moment]) -> Figure:
         axes = grid[:, column]
         size = len(moment.view)
         _cells(axes[0], moment.state["grid"])
-        _arrow(axes[0], *moment.state["agent"], ROBOT)
-        _arrow(axes[0], *moment.state["person"], PERSON)
+        for agent, colour in (("agent", ROBOT), ("person", PERSON)):
+            x, y, heading = (int(part) for part in moment.state[agent])
+            _arrow(axes[0], x, y, heading, colour)
         _cells(axes[1], moment.view)
         _arrow(axes[1], size // 2, size - 1, 3, ROBOT)
         _arrow(axes[1], *moment.path.poses[-1], PERSON)
