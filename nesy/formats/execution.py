@@ -25,6 +25,9 @@ OPTIONS = (
 )
 """The reachable part has as many states as it has codes: it needs no invariants and no heuristic."""
 
+WANDER = (0.2, 0.2, 0.6)
+"""Chances of left, right and forward in a random step."""
+
 
 def by_fast_downward(
     dbn: TwoSliceDBN, start: np.ndarray, goals: np.ndarray, outcomes: int = 1
@@ -96,7 +99,7 @@ class Executed:
     unsolved: int = 0
     """Of them those without a plan."""
     wandering: int = 0
-    """Random steps, taken where there was no plan."""
+    """Random steps, taken where there was no plan or the plan had been wrong before."""
     plans: dict[tuple[int, ...], Plan | None] = field(default_factory=dict)
     """Plans made so far, by the code they start from."""
 
@@ -115,7 +118,8 @@ def execute(
     """Drive to the goal of the crossing task by plans of Fast Downward, planning again on every surprise.
 
     The goals are the codes of all views with the goal straight ahead; a plan that has arrived ends with `forward`.
-    Where the planner finds no plan, a random step is taken.
+    Where the planner finds no plan, or has been wrong at the same code in this episode, a random step is taken: the
+    same plan would run in the same circle, since a code does not tell places apart that look alike.
 
     Args:
         domain: where.
@@ -140,19 +144,24 @@ def execute(
     for _ in range(episodes):
         result.episodes += 1
         waiting: Plan = []
+        wrong: set[tuple[int, ...]] = set()
+        before: tuple[int, ...] = ()
         expected: tuple[int, ...] | None = None
         for _ in range(longest):
             code = encode(observation["view"])[0].astype(np.int64)
             place = tuple(code.tolist())
             if expected is not None and place != expected:
                 result.surprises += 1
+                wrong.add(before)
                 waiting = []
             if place in there:
                 action, expected = FORWARD, None
             else:
-                waiting = waiting or _plan(result, dbn, code, goals, outcomes)
+                if not waiting and place not in wrong:
+                    waiting = _plan(result, dbn, code, goals, outcomes)
                 result.wandering += not waiting
-                action, expected = waiting.pop(0) if waiting else (int(rng.integers(3)), None)
+                action, expected = waiting.pop(0) if waiting else (int(rng.choice(3, p=WANDER)), None)
+            before = place
             observation, reward, terminated, truncated, _ = environment.step(np.array([action]))
             result.steps += 1
             if terminated[0] or truncated[0]:
