@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from planners.compare import EVALUATION_SEED, Cell, grid
 from planners.config import CompareConfig
 from planners.evaluation import evaluation_maps
 from planners.perception import Perception, Percepts
+from planners.replay_choice import MOST_EPISODES, Chosen, all_reasons, choose
 from planners.tree import Tree
 from planners.tree_top import top_of_flat_tree, top_of_pomdp_py_tree
 
@@ -39,27 +40,6 @@ RULE = (
     "of every agent under every condition, first seed: the first success, the first failure, and the worst regret "
     "(the optimum's return on the same episode, or the best agent's where there is no optimum, minus its own)"
 )
-MOST_EPISODES = 60
-REASONS = ("first success", "first failure", "worst regret")
-
-
-@dataclass(frozen=True)
-class Chosen:
-    """One episode to be played again.
-
-    Attributes:
-        episode: its number in the cell.
-        reasons: of `REASONS`.
-        total: its recorded return.
-        outcome: its recorded outcome.
-        regret: against the optimum or the best agent; None where no other agent met the same map.
-    """
-
-    episode: int
-    reasons: tuple[str, ...]
-    total: float
-    outcome: str
-    regret: float | None
 
 
 def record_replays(
@@ -103,7 +83,7 @@ def record_replays(
         "version": VERSION,
         "fingerprint": fingerprint,
         "rule": RULE,
-        "left_out": sum(len(_all_reasons(tables, cell)) for cell in cells) - len(episodes),
+        "left_out": sum(len(all_reasons(tables, cell)) for cell in cells) - len(episodes),
         "action_names": list(domain.spec.action_names),
         "cell_kinds": list(domain.spec.cell_kinds),
         "maps": [{"size": int(len(cells_of) ** 0.5), "cells": cells_of} for cells_of in maps],
@@ -124,61 +104,6 @@ def load_replays(path: Path) -> dict[str, Any]:
     if not isinstance(value, dict) or value.get("format") != FORMAT or value.get("version") != VERSION:
         raise UserError(f"{path}: not a file of replays of version {VERSION}; delete it and call: nesy report")
     return value
-
-
-def choose(tables: dict[Cell, dict[str, list[Any]]], most: int = MOST_EPISODES) -> dict[Cell, list[Chosen]]:
-    """The episodes to play again, by the rule of the module's head.
-
-    Args:
-        tables: per cell the columns `return`, `outcome` and `map_id` of its evaluation episodes.
-        most: episodes in all; further ones are left out, the worst regrets last.
-    """
-    every = {cell: _all_reasons(tables, cell) for cell in tables}
-    left = most
-    kept: dict[Cell, list[Chosen]] = {cell: [] for cell in tables}
-    for reason in ("worst regret", "first success", "first failure"):
-        for cell, candidates in every.items():
-            for candidate in candidates:
-                if reason in candidate.reasons and candidate not in kept[cell] and left > 0:
-                    kept[cell].append(candidate)
-                    left -= 1
-    return {cell: sorted(picked, key=lambda c: c.episode) for cell, picked in kept.items()}
-
-
-def _all_reasons(tables: dict[Cell, dict[str, list[Any]]], cell: Cell) -> list[Chosen]:
-    table = tables[cell]
-    regrets = [_regret(tables, cell, episode) for episode in range(len(table["return"]))]
-    picked: dict[int, list[str]] = {}
-    successes = [episode for episode, outcome in enumerate(table["outcome"]) if outcome == "success"]
-    failures = [episode for episode, outcome in enumerate(table["outcome"]) if outcome != "success"]
-    known = [episode for episode, regret in enumerate(regrets) if regret is not None]
-    if successes:
-        picked.setdefault(successes[0], []).append("first success")
-    if failures:
-        picked.setdefault(failures[0], []).append("first failure")
-    worst = max(known, key=lambda episode: (float(regrets[episode] or 0.0), -episode), default=None)
-    if worst is not None and (regrets[worst] or 0.0) > 0:
-        picked.setdefault(worst, []).append("worst regret")
-    return [
-        Chosen(episode, tuple(reasons), float(table["return"][episode]), table["outcome"][episode], regrets[episode])
-        for episode, reasons in sorted(picked.items())
-    ]
-
-
-def _regret(tables: dict[Cell, dict[str, list[Any]]], cell: Cell, episode: int) -> float | None:
-    """What the optimum, or else the best other agent, got more on the same episode of the same map."""
-    own = tables[cell]
-    others = [
-        (other, table)
-        for other, table in tables.items()
-        if other.variant == cell.variant
-        and other != cell
-        and episode < len(table["return"])
-        and table["map_id"][episode] == own["map_id"][episode]
-    ]
-    optimum = [table for other, table in others if other.agent == "optimum"]
-    best = [float(table["return"][episode]) for table in optimum or [table for _, table in others]]
-    return max(best) - float(own["return"][episode]) if best else None
 
 
 def _evaluated(run: RunFolder, cell: Cell) -> dict[str, list[Any]]:
