@@ -6,7 +6,7 @@ it calls in other files, so here the stamp of the cache covers the whole package
 Numba turns every function that it compiles into optimised machine code, also one that only other kernels call; and
 as a caller's code contains that of all it calls, deep calls are optimised and translated again at every level. Here
 only the functions that Python calls are: the others are kept as unoptimised code of LLVM, which is linked into them.
-That cuts the first start from 23 s to about 10 (docs/notes/speed.md).
+What that is worth: docs/notes/speed.md.
 """
 
 from __future__ import annotations

@@ -82,3 +82,57 @@ def test_the_checker_wants_determinism_and_sound_predicates(page):
     broken.predicates = Peeking()
     with pytest.raises(DomainError, match="by itself"):
         check_domain(broken, steps=60)
+
+
+def _changed(page, change):
+    """A corridor whose steps are changed before they are returned."""
+
+    class Changed(page["CorridorDomain"]):
+        def make(self, *args, **keywords):
+            env = super().make(*args, **keywords)
+            step = env.step
+            env.step = lambda actions: change(*step(actions))
+            return env
+
+    return Changed()
+
+
+def _with(infos, **changes):
+    return {**infos, **changes}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda o, r, te, tr, i: (o, r.astype(np.float32), te, tr, i), "reward"),
+        (lambda o, r, te, tr, i: (o, r * np.nan, te, tr, i), "finite"),
+        (lambda o, r, te, tr, i: (o, r, te.astype(int), tr, i), "terminated"),
+        (lambda o, r, te, tr, i: (o, r, te, tr, {k: v for k, v in i.items() if k != "distance"}), "distance"),
+        (lambda o, r, te, tr, i: (o, r, te, tr, _with(i, _final_obs=~i["_final_obs"])), "_final_obs"),
+        (lambda o, r, te, tr, i: (o, r, te, tr, _with(i, outcome=np.full(len(r), "won"))), "unknown outcomes"),
+        (lambda o, r, te, tr, i: (o, r, te, tr, _with(i, outcome=np.full(len(r), "lost"))), "ended episodes"),
+        (lambda o, r, te, tr, i: ({**o, "view": o["view"] + 9}, r, te, tr, i), "cell kinds"),
+        (lambda o, r, te, tr, i: ({**o, "configuration": o["configuration"] + 500}, r, te, tr, i), "configuration"),
+        (lambda o, r, te, tr, i: (o, r, te, tr, _with(i, final_obs={"view": 1 - o["view"] // 2})), "final_obs"),
+    ],
+)
+def test_the_checker_finds_broken_steps(page, change, message):
+    with pytest.raises(DomainError, match=message):
+        check_domain(_changed(page, change), steps=60)
+
+
+def test_the_checker_wants_bad_input_refused_and_names_that_can_be_used(page):
+    class Lenient(page["CorridorDomain"]):
+        def make(self, task, num_envs, variant="short", **keywords):
+            return super().make("following", num_envs, variant if variant in ("short", "long") else "short", **keywords)
+
+    with pytest.raises(DomainError, match="unknown task must raise"):
+        check_domain(Lenient(), steps=100)
+
+    class Unnamed(page["CorridorPredicates"]):
+        names = ("Goal",)
+
+    broken = page["CorridorDomain"]()
+    broken.predicates = Unnamed()
+    with pytest.raises(DomainError, match="ASP constant"):
+        check_domain(broken, steps=100)
