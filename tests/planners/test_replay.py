@@ -46,7 +46,7 @@ def test_replays_run_as_in_the_comparison(tiny_run: Path) -> None:
         assert episode["reproduced"], (episode["agent"], episode["influence"], episode["episode"])
         assert sum(step["reward"] for step in episode["steps"]) == pytest.approx(episode["return"], abs=0.01)
         assert ("q" in episode["steps"][0]) == (episode["agent"] == "dqn")
-        assert ("plan" in episode["steps"][0]) == (episode["agent"] == "pomdp")
+        assert ("plan" in episode["steps"][0]) == (episode["agent"] in ("pomdp", "search"))
 
 
 def test_a_damaged_file_is_named(tmp_path: Path) -> None:
