@@ -47,3 +47,27 @@ def test_unknown_mode_is_refused_and_human_mode_needs_no_screen_to_close(monkeyp
     env.reset(seed=0)
     env.step(2)
     env.close()
+
+
+def test_other_persons_are_drawn_but_never_shown_in_views():
+    alone = gymnasium.make("nesy/PersonFollowing-v0", variant="clean", render_mode="rgb_array").unwrapped
+    crowd = gymnasium.make("nesy/PersonFollowing-v0", variant="clean", render_mode="rgb_array", num_persons=4).unwrapped
+    grid = alone.reset(seed=1) and alone.state()["grid"]
+    crowd.reset(seed=1, options={"grid": grid})
+    alone.reset(seed=1, options={"grid": grid})
+    compared = 0
+    for action in (2, 1, 2, 2, 0, 2, 3, 1, 1, 2):
+        state = crowd.state()
+        others = {other[:2] for other in state["others"]} - {state["agent"][:2], state["person"][:2]}
+        picture = crowd.render()
+        for x, y in others:
+            tile = picture[y * 32 : y * 32 + 32, x * 32 : x * 32 + 32].astype(int)
+            assert ((abs(tile - 100) < 60).all(axis=2)).sum() > 100
+        o, _, _, _, _ = alone.step(action)
+        seen, _, _, _, _ = crowd.step(action)
+        if alone.state()["agent"] != crowd.state()["agent"]:
+            break  # somebody stood in the way
+        assert (o["view"] == seen["view"]).all()
+        assert o["configuration"] == seen["configuration"]
+        compared += 1
+    assert compared > 1
