@@ -19,7 +19,9 @@ import tyro
 
 from nesy.errors import UserError
 
-KEYS = {"\x1b[A": 2, "\x1b[C": 1, "\x1b[D": 0, "w": 2, "d": 1, "a": 0, " ": 3}
+ANEW = -1
+"""What the keyboard chooses instead of an action: another episode."""
+KEYS = {"r": ANEW, "\x1b[A": 2, "\x1b[C": 1, "\x1b[D": 0, "w": 2, "d": 1, "a": 0, " ": 3}
 HEADINGS = "▶▼◀▲"
 CELLS = ("  ", "██", "▒▒")
 
@@ -88,6 +90,11 @@ def _episode(
         action = choose()
         if action is None:
             return None
+        if action == ANEW:
+            _, info = env.reset()
+            total, steps = 0.0, 0
+            frames.clear()
+            continue
         _, reward, terminated, truncated, info = env.step(action)
         total, steps, ended = total + float(reward), steps + 1, terminated or truncated
 
@@ -137,7 +144,9 @@ def _keyboard() -> Iterator[Callable[[], int | None]]:
 
     def choose() -> int | None:
         while True:
-            key = os.read(descriptor, 3).decode(errors="ignore")
+            key = os.read(descriptor, 1).decode(errors="ignore")
+            if key == "\x1b":  # the arrow keys are three characters
+                key += os.read(descriptor, 2).decode(errors="ignore")
             if key in ("q", "\x03", ""):
                 return None
             if key in KEYS:

@@ -3,6 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
+import pty
+import re
+import subprocess
+import sys
+import termios
 from pathlib import Path
 
 import pytest
@@ -150,3 +156,25 @@ def test_play_tells_what_is_wrong(capsys: pytest.CaptureFixture[str], tmp_path: 
         assert main(["play", *arguments]) == 2
         assert expected in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_person_drives_with_the_keyboard(tmp_path: Path) -> None:
+    """In a real terminal: keys move the robot, r begins again, q quits, and the terminal is as it was before."""
+    master, slave = pty.openpty()
+    before = termios.tcgetattr(slave)
+    command = [sys.executable, "-m", "nesy.cli.main", "play", "--variant", "paper", "--json"]
+    with subprocess.Popen(command, stdin=slave, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as game:
+        assert game.stderr is not None
+        drawn = b""
+        while b"step 0" not in drawn and (more := os.read(game.stderr.fileno(), 4096)):
+            drawn += more
+        os.write(master, b"w\x1b[Crw\x1b[D\x1b[Aq")
+        shown, more = game.communicate(timeout=60)
+        drawn += more
+    assert game.returncode == 0, drawn.decode()
+    assert json.loads(shown) == {"episodes": []}
+    steps = re.findall(r"step (\d+)  return", drawn.decode())
+    assert steps == ["0", "1", "2", "0", "1", "2", "3"]
+    assert termios.tcgetattr(slave) == before
+    os.close(master)
+    os.close(slave)

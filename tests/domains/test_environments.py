@@ -15,9 +15,10 @@ from domains.core import BatchedEnvironment, ViewGeometry
 IDS = ("nesy/PersonFollowing-v0", "nesy/Crossing-v0")
 
 
-@pytest.mark.parametrize("name", IDS)
-def test_gymnasium_checker_passes(name):
-    check_env(gymnasium.make(name, render_mode="rgb_array").unwrapped)
+@pytest.mark.parametrize("variant", ["paper", "clean", "occluded", "intent", "false_belief"])
+def test_gymnasium_checker_passes(variant):
+    for name in IDS:
+        check_env(gymnasium.make(name, variant=variant, render_mode="rgb_array").unwrapped)
 
 
 def test_same_seed_same_episodes():
