@@ -34,6 +34,14 @@ OUTPUTS: dict[str, tuple[str, ...]] = {
     "compare": ("ialm", "policies", "results"),
     "report": ("report.html",),
 }
+# What each step writes into summary.json, as sections or as times; what an interruption left out is made good.
+SECTIONS: dict[str, tuple[str, ...]] = {
+    "collect": ("experience",),
+    "train": ("world_model",),
+    "extract": ("dbn", "fidelity", "perspective", "semantics"),
+    "compare": ("comparison", "replays"),
+    "report": (),
+}
 LIBRARIES = ("torch", "numpy", "numba", "gymnasium", "minigrid", "pomdp-py", "clingo", "pyarrow", "scipy")
 
 
@@ -168,6 +176,11 @@ class Pipeline:
                     shutil.rmtree(path)
                 else:
                     path.unlink(missing_ok=True)
+        gone = {name for step in steps[steps.index(first) :] for name in (step, *SECTIONS[step])}
+        if self.run.summary.is_file():
+            kept = {name: value for name, value in self.run.read_summary().items() if name not in gone}
+            kept["timing"] = {name: value for name, value in kept.get("timing", {}).items() if name not in gone}
+            write_json(self.run.summary, kept)
 
     def _timed(self, step: str, work: Callable[[], Any]) -> Any:
         started = time.perf_counter()
@@ -196,7 +209,7 @@ class Pipeline:
         from domains.core import load_domain
         from nesy.collection import collect
 
-        if not self.run.has("collect"):
+        if not self.run.has("collect") or "experience" not in self.run.read_summary():
             domain = load_domain(self.config.domain)
             rows = self._timed(
                 "collect",
@@ -216,7 +229,7 @@ class Pipeline:
     def train(self) -> dict[str, Any]:
         """Train the world model."""
         self.run.require("collect")
-        if not self.run.has("train"):
+        if not self.run.has("train") or "world_model" not in self.run.read_summary():
             from domains.core import load_domain
             from nesy.world_model import train
 
@@ -237,41 +250,34 @@ class Pipeline:
         return dict(self.run.read_summary()["world_model"])
 
     def extract(self) -> dict[str, Any]:
-        """Extract the 2DBN."""
+        """Extract the 2DBN, and measure it: fidelity, perspective shift, what codes mean."""
         self.run.require("collect", "train")
-        if not self.run.has("extract"):
-            from nesy.dbn import extract_run, fidelity_report
+        config = self.config
+        if not self.run.has("extract") or "dbn" not in self.run.read_summary():
+            from nesy.dbn import extract_run
 
-            figures = self._timed("extract", lambda: extract_run(self.run, self.config.domain, self.config.extract))
-            figures["fidelity"] = self._timed(
-                "fidelity",
-                lambda: fidelity_report(self.run, self.config.domain, self.config.variant, self.config.seed),
-            )
-            self.run.update_summary(dbn=figures)
-            self._evaluate_shift()
-            self._evaluate_semantics()
+            self._figures("dbn", "extract", lambda: extract_run(self.run, config.domain, config.extract))
+        measured = self.run.read_summary()
+        where = (self.run, config.domain, config.variant, config.seed)
+        if "fidelity" not in measured["dbn"]:
+            from nesy.dbn import fidelity_report
+
+            fidelity = self._timed("fidelity", lambda: fidelity_report(*where))
+            self.run.update_summary(dbn={**measured["dbn"], "fidelity": fidelity})
+        if "perspective" not in measured:
+            from nesy.perspective_gates import evaluate_run
+
+            self._figures("perspective", "perspective", lambda: evaluate_run(*where, config.train.held_out))
+        if "semantics" not in measured:
+            from nesy.asp.run_semantics import semantics_report
+
+            self._figures("semantics", "semantics", lambda: semantics_report(*where))
         return dict(self.run.read_summary()["dbn"])
 
-    def _evaluate_semantics(self) -> None:
-        """Measure how well short rules say what codes mean."""
-        from nesy.asp.run_semantics import semantics_report
-
-        config = self.config
-        figures = self._timed(
-            "semantics", lambda: semantics_report(self.run, config.domain, config.variant, config.seed)
-        )
-        self.run.update_summary(semantics=figures)
-
-    def _evaluate_shift(self) -> None:
-        """Measure the perspective shift, which takes the world model and, for some architectures, the 2DBN."""
-        from nesy.perspective_gates import evaluate_run
-
-        config = self.config
-        figures = self._timed(
-            "perspective",
-            lambda: evaluate_run(self.run, config.domain, config.variant, config.seed, config.train.held_out),
-        )
-        self.run.update_summary(perspective=figures)
+    def _figures(self, section: str, timed_as: str, work: Callable[[], Any]) -> None:
+        """Do `work` and store what it returns as a section of summary.json, with the time it took."""
+        figures = self._timed(timed_as, work)
+        self.run.update_summary(**{section: figures})
 
     def compare(self, engine: str = "local", address: str | None = None) -> dict[str, Any]:
         """Compare the agents, with an engine of `planners.engines`."""
