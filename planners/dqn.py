@@ -118,7 +118,8 @@ class DQNPolicy:
             "trained": json.dumps(self.trained),
         }
         with atomic_path(path) as temporary:
-            save_file(self.network.state_dict(), str(temporary), metadata=metadata)
+            # One entry, since safetensors writes several in any order: the same policy is to give the same bytes.
+            save_file(self.network.state_dict(), str(temporary), metadata={"policy": json.dumps(metadata)})
 
     @classmethod
     def load(cls, path: Path) -> DQNPolicy:
@@ -131,7 +132,7 @@ class DQNPolicy:
 
         try:
             with safe_open(str(path), framework="pt") as stored:
-                metadata = stored.metadata() or {}
+                metadata = json.loads((stored.metadata() or {})["policy"])
                 weights = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
             values = json.loads(metadata["config"])
             config = DQNConfig(**{**values, "hidden": tuple(values["hidden"])})

@@ -20,10 +20,12 @@ def main() -> None:
     parser.add_argument("--run", type=Path, default=Path("runs/default"))
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--in-sight", action="store_true", help="an expert drives until the goal is in view")
     options = parser.parse_args()
     codec = SymbolicCodec(load_world_model(options.run / "world_model"))
     dbn, codebook = TwoSliceDBN.load(options.run / "dbn"), Codebook.load(options.run / "dbn")
-    done = execute(load_domain(), "paper", dbn, codebook, codec.codes, options.episodes, options.seed)
+    how = {"outcomes": 1, "in_sight": True} if options.in_sight else {}
+    done = execute(load_domain(), "paper", dbn, codebook, codec.codes, options.episodes, options.seed, **how)
     print(f"goal entered in {done.reached} of {done.episodes} episodes, {done.steps / done.episodes:.1f} steps each")
     print(f"{done.calls} problems for the planner, {done.unsolved} without a plan, {done.wandering} random steps")
     print(f"{done.surprises} steps ended in another view than planned")

@@ -23,6 +23,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGES = ("README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")))
 RUN_ELSEWHERE = {
     "docs/asp.md": "tests/nesy/asp/test_documentation.py",
+    "docs/formats.md": "tests/nesy/formats/test_documentation.py",
     "docs/new-domain.md": "tests/domains/test_new_domain.py",
 }
 """Pages whose blocks a test of their own runs, with more to say about what comes out."""

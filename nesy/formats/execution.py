@@ -114,6 +114,7 @@ def execute(
     seed: int,
     longest: int = 60,
     outcomes: int = 2,
+    in_sight: bool = False,
 ) -> Executed:
     """Drive to the goal of the crossing task by plans of Fast Downward, planning again on every surprise.
 
@@ -132,6 +133,7 @@ def execute(
         longest: steps after which an episode is given up.
         outcomes: of a step that the planner may choose among; with 1, the most probable ones, it mostly finds no
             plan from the start, since these never show the goal.
+        in_sight: let the task's expert drive until the goal is in view, and plan from there.
     """
     side = codebook.views.shape[1]
     ahead = (side // 2, side - 2)
@@ -147,6 +149,7 @@ def execute(
         wrong: set[tuple[int, ...]] = set()
         before: tuple[int, ...] = ()
         expected: tuple[int, ...] | None = None
+        led = in_sight
         for _ in range(longest):
             code = encode(observation["view"])[0].astype(np.int64)
             place = tuple(code.tolist())
@@ -154,7 +157,10 @@ def execute(
                 result.surprises += 1
                 wrong.add(before)
                 waiting = []
-            if place in there:
+            led = led and GOAL not in observation["view"][0]
+            if led:
+                action, expected = int(environment.expert_actions("goal")[0]), None
+            elif place in there:
                 action, expected = FORWARD, None
             else:
                 if not waiting and place not in wrong:

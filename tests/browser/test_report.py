@@ -124,7 +124,7 @@ def test_values_of_dqn_and_planner_are_shown(opened: Opened) -> None:
         assert page.locator(".panel h3", has_text=title).count() == 1
         assert page.locator("#replay-view .bars tr").count() == 4
         assert page.locator("#replay-view .bars tr.chosen").count() == 1
-    assert page.locator("#replay-view ul.tree").count() > 1
+    assert page.locator("#replay-view ul.tree").count() >= 1
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -108,9 +108,9 @@ def test_the_page_is_self_contained_and_its_table_comes_from_the_summary(run: Pa
     for anchor in ("comparison", "learning", "belief", "world-model", "dbn", "provenance"):
         assert f'<section id="{anchor}">' in page
     assert page.count("<svg") >= 3
-    # nothing is loaded: links lead within the page, pictures are in it
+    # nothing is loaded: links lead within the page, pictures and scripts are in it
     assert not re.search(r'(?:src|href)="(?!#|data:)', page)
-    assert "<script" not in page
+    assert "Content-Security-Policy" in page
 
 
 def test_running_again_repeats_nothing(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -188,7 +188,7 @@ DAMAGE = {
         ("world_model/model.safetensors", "extract", "dbn"),
         ("dbn/tables.npz", "compare", "results"),
         ("dbn/model.json", "query --means 0=0", None),
-        ("results/episodes.parquet", "report", None),
+        ("results/statistics.json", "report", None),
         ("config.json", "train", None),
         ("summary.json", "report", None),
     ],
@@ -209,7 +209,7 @@ def test_an_agent_s_choice_is_explained(run: Path, tmp_path: Path, capsys: pytes
     rules = tmp_path / "rules.lp"
     rules.write_text("forbidden(A) :- action(A), A != stay.\n")
     question = ["query", "--run", str(run), "--start", "0", "--person", "0,2,1", "--json"]
-    for agent in ("dqn-full-perspective-shift", "search-full-perspective-shift"):
+    for agent in ("dqn-full-perspective-shift", "pomdp-full-perspective-shift"):
         capsys.readouterr()
         assert main([*question, "--why", agent]) == 0
         found = json.loads(capsys.readouterr().out)

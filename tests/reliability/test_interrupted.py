@@ -27,7 +27,9 @@ def test_a_run_killed_in_every_step_ends_as_the_undisturbed_run(tiny_run: Path, 
         assert status == -signal.SIGKILL
         assert half_written(folder) == []
     status, said = interrupt_when(folder, TINY, "results/comparison.json", signal.SIGTERM)
-    assert status in (0, 130), said  # it may have been done in time
+    # It may have been done in time; and Python ends by the signal itself, which a shell reports as 130 too, where the
+    # interrupt met code made by exec().
+    assert status in (0, 130, -signal.SIGINT), said
     assert "Traceback" not in said
     status, said, _ = finish(folder, TINY)
     assert status == 0, said

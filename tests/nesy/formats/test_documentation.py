@@ -16,6 +16,7 @@ from tests.nesy.dbn.models import random_dbn
 from tests.nesy.dbn.steps import with_steps
 
 DOCS = Path(__file__).parents[3] / "docs" / "formats.md"
+PYTHON = re.findall(r"```python\n(.*?)```", DOCS.read_text(), re.DOTALL)
 COMMANDS = [
     line for block in re.findall(r"```sh\n(.*?)```", DOCS.read_text(), re.DOTALL) for line in block.splitlines() if line
 ]
@@ -35,7 +36,7 @@ def run(tmp_path_factory):
     write_json(folder.experience / "complete.json", {"rows": 1})
     folder.world_model.mkdir()
     (folder.world_model / "model.safetensors").touch()
-    folder.update_summary(dbn={"rows": len(dbn.probabilities)})
+    folder.update_summary(dbn={"rows": len(dbn.probabilities), "fidelity": {}}, perspective={}, semantics={})
     return folder
 
 
@@ -72,3 +73,10 @@ def test_formats_of_the_page_are_all_formats():
 
     named = set(re.findall(r"`([a-z]+)`", "".join(re.findall(r"^\| `.*?\|", DOCS.read_text(), re.MULTILINE))))
     assert set(FORMATS) <= named
+
+
+def test_python_of_the_page(run):
+    names = {}
+    for block in PYTHON:
+        exec(compile(block.replace("runs/demo", str(run.path)), DOCS.name, "exec"), names)
+    assert names["table"].look_up(names["codes"], names["actions"], names["next_codes"]).shape == (1, 1, 2)

@@ -92,11 +92,10 @@ def test_plans_of_fast_downward_are_executed_in_the_environment():
     _, run, _ = extracted_run()
     codec = SymbolicCodec(load_world_model(run.world_model))
     dbn, codebook = TwoSliceDBN.load(run.dbn), Codebook.load(run.dbn)
-    done = execute(load_domain(), "paper", dbn, codebook, codec.codes, 1, seed=0, longest=40, outcomes=2)
-    assert done.episodes == 1 and done.calls >= 1 and done.steps <= 40
-    # every step was planned, wandered, or the last one onto the goal
-    assert done.wandering < done.steps
-    assert done.reached == 1
+    # With the goal in view nothing that matters is hidden: the plans arrive.
+    done = execute(load_domain(), "paper", dbn, codebook, codec.codes, 4, seed=0, outcomes=1, in_sight=True)
+    assert done.episodes == 4 and done.calls >= 1
+    assert done.reached >= 3 and done.wandering == 0
 
 
 def shortest(dbn, start, beam=16):

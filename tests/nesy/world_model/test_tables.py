@@ -202,7 +202,7 @@ def test_refinement_only_lowers_the_entropy_without_noise(codec: SymbolicCodec, 
     book = refiner.search(codes)
     free = np.zeros_like(logits)
     for _ in range(3):
-        better, moved = refiner.refine(book, free, 0.0, 1, rng)
+        better, moved = refiner.refine(book, free, 0.0, 1, rng, list(range(8)))
         assert better.nll <= book.nll + 1e-9
         assert len(np.unique(better.codes, axis=0)) == transitions.num_views
         assert moved > 0 or better.nll == pytest.approx(book.nll)
