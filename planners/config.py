@@ -128,7 +128,7 @@ class DQNConfig:
 class SearchConfig:
     """How the planners search."""
 
-    simulations: int = 1500
+    simulations: int = 1000
     """Simulations per decision."""
     time_limit: float = 0.0
     """Seconds per decision after which the search stops early; 0 for no limit (and repeatable results)."""

@@ -29,6 +29,8 @@ SUPPORT = 20
 fold holds hardly any."""
 MOST_FACTORS = 3
 """... and if at most so many factors settle it (`determined`)."""
+OVERALL = ("count", "precision", "recall", "length")
+"""Figures over all predicates with support; folds of maps would take twice the time to say the same."""
 
 
 def scores(
@@ -49,7 +51,7 @@ def scores(
 
     Returns:
         `predicates`: predicates from codes, those that the code determines by few factors; `all_predicates`: all
-        that vary enough; `values`: values from predicates; each with `count`, macro averages
+        that vary enough (without maps); `values`: values from predicates; each with `count`, macro averages
         `precision` and `recall` over held-out views, `length` (mean conditions of the rules from all views), the
         same by maps (`maps_precision`, `maps_recall`) and `each`, one record per predicate or value.
     """
@@ -64,7 +66,7 @@ def scores(
             partial(predicate_rules, codebook, name, held_out=0.0, num_values=num_values),
             codebook.codes.astype(np.int64),
             codebook.predicate(name),
-            divisions if name in supported else {},
+            divisions if name in chosen else {"": divisions[""]} if name in supported else {},
             factor_names,
             predicates=False,
         )
@@ -86,7 +88,7 @@ def scores(
     everything = {name: {**record, "counts": record["supported"]} for name, record in predicates.items()}
     return {
         "predicates": _macro(predicates),
-        "all_predicates": {name: figure for name, figure in _macro(everything).items() if name != "each"},
+        "all_predicates": {name: figure for name, figure in _macro(everything).items() if name in OVERALL},
         "values": _macro(values),
         "folds": FOLDS,
         "views": len(codebook),
