@@ -9,6 +9,7 @@ time. Then the folder must hold whole files only, and the same command must fini
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import os
 import signal
@@ -22,6 +23,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
+from safetensors.numpy import load_file
 
 SMOKE = ("--preset", "smoke", "--jobs", "2")
 IGNORED = ("tensorboard", ".lock", "report.html")
@@ -118,9 +120,16 @@ def _content(path: Path) -> Any:
     """What a file says, without times: tables as columns, JSON as values, others as bytes."""
     if path.suffix == ".parquet":
         table = pq.ParquetFile(path).read()
-        return table.drop_columns([name for name in table.column_names if name in TIMES]).replace_schema_metadata(None)
+        return table.drop_columns([name for name in table.column_names if name.split(".")[-1] in TIMES]).replace_schema_metadata(None)
     if path.suffix == ".json":
         return _timeless(json.loads(path.read_text()))
+    if path.suffix == ".csv":
+        rows = csv.DictReader(path.read_text().splitlines())
+        return [{name: value for name, value in row.items() if name.split(".")[-1] not in TIMES} for row in rows]
+    if path.suffix == ".safetensors":  # the metadata of a checkpoint says how long it took
+        return {name: (array.dtype, array.tobytes()) for name, array in load_file(path).items()}
+    if path.suffix in (".md", ".tex"):
+        return None  # the rows of the CSV beside it, with times in their midst
     if path.suffix == ".jsonl":
         return [_timeless(json.loads(line)) for line in path.read_text().splitlines()]
     return path.read_bytes()

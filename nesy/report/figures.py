@@ -18,6 +18,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
+# Ids in an SVG are hashes with a salt that is otherwise random: the same data are to give the same file.
+matplotlib.rcParams["svg.hashsalt"] = "nesy"
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 # empty, wall, goal, unseen
 CELL_COLOURS = ListedColormap(["#f4f1ea", "#4d4d4d", "#009E73", "#b9c6d6"])
