@@ -120,7 +120,8 @@ def _content(path: Path) -> Any:
     """What a file says, without times: tables as columns, JSON as values, others as bytes."""
     if path.suffix == ".parquet":
         table = pq.ParquetFile(path).read()
-        return table.drop_columns([name for name in table.column_names if name.split(".")[-1] in TIMES]).replace_schema_metadata(None)
+        times = [name for name in table.column_names if name.split(".")[-1] in TIMES]
+        return table.drop_columns(times).replace_schema_metadata(None)
     if path.suffix == ".json":
         return _timeless(json.loads(path.read_text()))
     if path.suffix == ".csv":
