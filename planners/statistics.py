@@ -50,17 +50,7 @@ def bootstrap(
     point = float(statistic(values, axis=-1))
     if len(values) == 1 or np.ptp(values) == 0.0:
         return Interval(point, point, point)
-    result = stats.bootstrap(
-        (values,),
-        statistic,
-        n_resamples=resamples,
-        confidence_level=confidence,
-        method="percentile",
-        vectorized=True,
-        axis=-1,
-        rng=np.random.default_rng(seed),
-    )
-    return Interval(point, float(result.confidence_interval.low), float(result.confidence_interval.high))
+    return _percentiles([values], statistic, point, seed, confidence, resamples)
 
 
 def stratified_bootstrap(
@@ -90,9 +80,21 @@ def stratified_bootstrap(
         whole = [part[..., :size] for part, size in zip(resampled, sizes, strict=True)]
         return statistic(np.concatenate(whole, axis=-1), axis=axis)
 
+    return _percentiles(samples, pooled, point, seed, confidence, resamples)
+
+
+def _percentiles(
+    samples: list[np.ndarray],
+    statistic: Callable[..., np.ndarray],
+    point: float,
+    seed: int,
+    confidence: float,
+    resamples: int,
+) -> Interval:
+    """The percentile interval of a statistic of independent samples, by scipy."""
     result = stats.bootstrap(
         samples,
-        pooled,
+        statistic,
         n_resamples=resamples,
         confidence_level=confidence,
         method="percentile",
