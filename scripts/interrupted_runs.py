@@ -144,17 +144,19 @@ def _timeless(value: Any) -> Any:
 
 def trial(
     folder: Path, options: Sequence[str], reference: Path, moments: Sequence[float], number: int = signal.SIGKILL
-) -> list[str]:
-    """Interrupt one run at each of the moments (seconds after its start), resume it, and compare.
+) -> tuple[list[str], int]:
+    """Interrupt one run at each of the moments (seconds after it was started again), resume it, and compare.
 
     Returns:
-        What was wrong; empty if all is well.
+        What was wrong, empty if all is well, and how many of the signals found the run still running.
     """
     wrong: list[str] = []
+    sent = 0
     for after in moments:
         status, said = interrupt(folder, options, after, number)
         if status is None:
             break
+        sent += 1
         if "Traceback" in said:
             wrong.append(f"a traceback after {after:.1f} s: {said.strip().splitlines()[-1]}")
         if number != signal.SIGKILL and (status != 130 or "goes on where it stopped" not in said):
@@ -162,24 +164,23 @@ def trial(
         wrong += [f"after {after:.1f} s half-written: {name}" for name in half_written(folder)]
     status, said, _ = finish(folder, options)
     if status:
-        return [*wrong, f"resumed, it ends with status {status}: {' '.join(said.strip().splitlines()[-3:])}"]
+        return [*wrong, f"resumed, it ends with status {status}: {' '.join(said.strip().splitlines()[-3:])}"], sent
     left = [p.name for p in folder.rglob("*") if p.name.startswith(".") and ".tmp" in p.name]
-    return wrong + [f"temporary file left: {name}" for name in left] + differences(reference, folder)
+    return wrong + [f"temporary file left: {name}" for name in left] + differences(reference, folder), sent
 
 
 def main() -> int:
     """Print one line per run and the count; the status is 1 unless every run ended as it should."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--kills", type=int, default=50)
-    parser.add_argument("--kills-per-run", type=int, default=1)
+    parser.add_argument("--kills", type=int, default=50, help="signals in all")
+    parser.add_argument("--kills-per-run", type=int, default=1, help="one after the other, each when it has been resumed")
     parser.add_argument("--signal", choices=("KILL", "TERM", "INT"), default="KILL")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("options", nargs="*", default=list(SMOKE), help="options of `nesy run`, after --")
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     rng = np.random.default_rng(options.seed)
-    good = 0
-    runs = -(-options.kills // options.kills_per_run)
+    good = runs = sent = 0
     with tempfile.TemporaryDirectory() as scratch:
         reference = Path(scratch) / "reference"
         status, said, _ = finish(reference, options.options)  # also compiles the kernels
@@ -187,18 +188,16 @@ def main() -> int:
             print(said, file=sys.stderr)
             return 1
         _, _, seconds = finish(Path(scratch) / "timed", options.options)
-        print(f"undisturbed: {seconds:.1f} s")
-        for index in range(runs):
-            moments = rng.uniform(0.2, seconds, size=options.kills_per_run).tolist()
-            folder = Path(scratch) / f"run-{index}"
-            wrong = trial(folder, options.options, reference, moments, getattr(signal, f"SIG{options.signal}"))
-            good += not wrong
-            where = ", ".join(f"{moment:.1f}" for moment in moments)
-            print(
-                f"{index + 1:3}: SIG{options.signal} after {where} s: {'; '.join(wrong[:5]) or 'as undisturbed'}",
-                flush=True,
-            )
-    print(f"{good} of {runs} runs ({options.kills} signals) ended with the results of the undisturbed run")
+        print(f"undisturbed: {seconds:.1f} s", flush=True)
+        longest = seconds * min(1.0, 2.0 / options.kills_per_run)  # so that all of a run's signals find it running
+        while sent < options.kills:
+            moments = rng.uniform(0.2, longest, size=min(options.kills_per_run, options.kills - sent)).tolist()
+            folder = Path(scratch) / f"run-{runs}"
+            wrong, found = trial(folder, options.options, reference, moments, getattr(signal, f"SIG{options.signal}"))
+            runs, sent, good = runs + 1, sent + found, good + (not wrong)
+            where = ", ".join(f"{moment:.1f}" for moment in moments[:found])
+            print(f"{runs:3}: SIG{options.signal} after {where} s: {'; '.join(wrong[:5]) or 'as undisturbed'}", flush=True)
+    print(f"{good} of {runs} runs ({sent} signals) ended with the results of the undisturbed run")
     return int(good < runs)
 
 
