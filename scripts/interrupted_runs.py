@@ -173,7 +173,9 @@ def main() -> int:
     """Print one line per run and the count; the status is 1 unless every run ended as it should."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--kills", type=int, default=50, help="signals in all")
-    parser.add_argument("--kills-per-run", type=int, default=1, help="one after the other, each when it has been resumed")
+    parser.add_argument(
+        "--kills-per-run", type=int, default=1, help="one after the other, each when it has been resumed"
+    )
     parser.add_argument("--signal", choices=("KILL", "TERM", "INT"), default="KILL")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("options", nargs="*", default=list(SMOKE), help="options of `nesy run`, after --")
@@ -196,7 +198,9 @@ def main() -> int:
             wrong, found = trial(folder, options.options, reference, moments, getattr(signal, f"SIG{options.signal}"))
             runs, sent, good = runs + 1, sent + found, good + (not wrong)
             where = ", ".join(f"{moment:.1f}" for moment in moments[:found])
-            print(f"{runs:3}: SIG{options.signal} after {where} s: {'; '.join(wrong[:5]) or 'as undisturbed'}", flush=True)
+            print(
+                f"{runs:3}: SIG{options.signal} after {where} s: {'; '.join(wrong[:5]) or 'as undisturbed'}", flush=True
+            )
     print(f"{good} of {runs} runs ({sent} signals) ended with the results of the undisturbed run")
     return int(good < runs)
 
