@@ -59,17 +59,16 @@ def build_player(
     if cell.agent in settings.PLANNING_AGENTS:
         perception = Perception(codec, cell.influence, np.random.default_rng([own_seed, 1]))
         return Built(
-            Player(_planner(cell, run, domain, config, own_seed), perception, mask), None, _practised(cell, run)
+            Player(_planner(cell, run, domain, config, own_seed, codec), perception, mask), None, _practised(cell, run)
         )
     if cell.policy:
         return _stored(cell, Path(cell.policy), codec, mask, own_seed)
-    from planners.dqn import train
+    from planners.dqn import Training, train
 
     # Learning starts from the same weights and explores alike under every influence mode: only b~ differs.
     learning_seed = int(np.random.SeedSequence([seed, cell.seed]).generate_state(1)[0])
-    policy, training = train(
-        domain, codec, cell.inputs, cell.influence, cell.variant, config.dqn, learning_seed, progress, mask, checkpoint
-    )
+    learner = Training(domain, codec, cell.inputs, cell.influence, cell.variant, config.dqn, learning_seed, mask)
+    policy, training = train(learner, progress, checkpoint)
     path = run.policies / f"{cell.name}.safetensors"
     policy.save(path)
     return _stored(cell, path, codec, mask, own_seed)._replace(training=training)
@@ -137,11 +136,15 @@ def _stored(cell: Cell, path: Path, codec: Codec, mask: ActionMask | None, own_s
     return Built(Player(DQNAgent(policy), perception, mask), None, int(policy.trained.get("steps", 0)))
 
 
-def _planner(cell: Cell, run: RunFolder, domain: Domain, config: CompareConfig, seed: int) -> Agent:
+def _planner(cell: Cell, run: RunFolder, domain: Domain, config: CompareConfig, seed: int, codec: Codec) -> Agent:
     from planners.compare import ialm_folder
     from planners.ialm import IALM
 
     model = IALM.load(ialm_folder(run, cell.variant))
+    if config.rules:
+        from planners.influence_rules import constrain_influence
+
+        model, _ = constrain_influence(model, [Path(rule) for rule in config.rules], codec, domain)
     return PlanningAgent(cell.agent, model, config.search_of_cells, domain.spec.geometry, seed)
 
 

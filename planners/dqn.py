@@ -31,8 +31,8 @@ from nesy.progress import SILENT, Progress
 from nesy.run_folder import atomic_path
 from planners.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from planners.config import DQNConfig
-from planners.memory import Replay
-from planners.perception import Codec, Percepts
+from planners.memory import Replay, distinct
+from planners.perception import Codec, Perception, Percepts
 from planners.published import dqn_perception
 from planners.shielding import ActionMask
 
@@ -148,29 +148,13 @@ class DQNPolicy:
 
 
 def train(
-    domain: Domain,
-    codec: Codec,
-    inputs: str,
-    influence: str,
-    variant: str,
-    config: DQNConfig,
-    seed: int,
-    progress: Progress = SILENT,
-    mask: ActionMask | None = None,
-    checkpoint: Path | None = None,
+    training: Training, progress: Progress = SILENT, checkpoint: Path | None = None
 ) -> tuple[DQNPolicy, dict[str, np.ndarray]]:
-    """Train a policy.
+    """Train to the end.
 
     Args:
-        domain: gives the environments.
-        codec: encodes views.
-        inputs: input set, `paper` or `full`.
-        influence: influence mode.
-        variant: variant of the task.
-        config: how to learn.
-        seed: of everything random here.
+        training: what is learned, as it stands.
         progress: told of finished episodes.
-        mask: the allowed actions; None for all.
         checkpoint: a file from which a stopped training goes on, with the same results; None to do without.
 
     Returns:
@@ -178,11 +162,11 @@ def train(
         (code), `step` (environment steps taken so far).
     """
     torch.set_num_threads(1)
-    training = Training(domain, codec, inputs, influence, variant, config, seed, mask)
+    config = training.config
     if checkpoint is not None:
         training.resume(checkpoint)
     told, saved = 0, time.monotonic()
-    with progress.task(f"dqn {inputs}/{influence}", config.episodes) as task:
+    with progress.task(f"dqn {training.inputs}/{training.about['influence']}", config.episodes) as task:
         while not training.over:
             training.step(training.choose())
             training.learn()
@@ -215,8 +199,21 @@ class Training:
         config: DQNConfig,
         seed: int,
         mask: ActionMask | None = None,
+        perception: Perception | None = None,
     ) -> None:
-        """Set everything up; the arguments are those of `train`."""
+        """Set everything up.
+
+        Args:
+            domain: gives the environments.
+            codec: encodes views.
+            inputs: input set, `paper` or `full`.
+            influence: influence mode.
+            variant: variant of the task.
+            config: how to learn.
+            seed: of everything random here.
+            mask: the allowed actions; None for all.
+            perception: what makes b~, where that is another than influence mode and settings ask for.
+        """
         self.config, self.inputs, self.mask = config, inputs, mask
         self.about = {"influence": influence, "variant": variant, "seed": seed, "episodes": config.episodes}
         self.num_actions = len(domain.spec.action_names)
@@ -224,7 +221,7 @@ class Training:
         sequence = np.random.SeedSequence([seed, 0xD91])
         self.rng, perception_rng = (np.random.default_rng(child) for child in sequence.spawn(2))
         self.env: Any = domain.make("following", config.num_envs, variant=variant, seed=int(self.rng.integers(2**31)))
-        self.perception = dqn_perception(codec, influence, perception_rng, config)
+        self.perception = perception or dqn_perception(codec, influence, perception_rng, config)
         generator = torch.Generator().manual_seed(int(self.rng.integers(2**62)))
         observation, _ = self.env.reset(seed=int(self.rng.integers(2**31)))
         self.state, self.allowed = self._perceive(observation, self.env.person_views())
@@ -319,19 +316,25 @@ class Training:
         self.owed -= int(self.owed)
 
     def update(self) -> None:
-        """One gradient step on one batch, and the target network after it."""
+        """One gradient step on one batch, and the target network after it.
+
+        A batch holds many a state several times (half of it are repeats); the networks are asked once for each.
+        """
         config, network = self.config, self.network
         age, env, weight = self.replay.draw(config.batch_size, self.rng, config.prioritised)
-        batch = self.replay.n_step(age, env, config.n_step, config.discount)
-        state, action, reward, next_state, factor, allowed = (torch.from_numpy(part) for part in batch)
+        states, action, reward, next_states, factor, allowed = self.replay.n_step(
+            age, env, config.n_step, config.discount
+        )
+        state, at = distinct(states)
+        next_state, next_at = distinct(next_states)
         with torch.no_grad():
-            next_values = self.target(next_state)
-            chooser = network(next_state) if config.double else next_values
+            next_values = self.target(next_state)[next_at]
+            chooser = network(next_state)[next_at] if config.double else next_values
             if self.mask is not None:
-                chooser = chooser.masked_fill(~allowed, -torch.inf)
+                chooser = chooser.masked_fill(~torch.from_numpy(allowed), -torch.inf)
             best = next_values.gather(1, chooser.argmax(dim=1, keepdim=True)).squeeze(1)
-            goal = reward + factor * best
-        value = network(state).gather(1, action[:, None]).squeeze(1)
+            goal = torch.from_numpy(reward) + torch.from_numpy(factor) * best
+        value = network(state)[at, torch.from_numpy(action)]
         loss = (nn.functional.smooth_l1_loss(value, goal, reduction="none") * torch.from_numpy(weight)).mean()
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()

@@ -8,6 +8,7 @@ The sum stops where an episode ended. Priorities: Schaul et al., "Prioritized ex
 from __future__ import annotations
 
 import numpy as np
+import torch
 
 
 class Replay:
@@ -85,3 +86,10 @@ class Replay:
         factor *= self.bootstrap[end, env]
         states = self.state[first, env], self.action[first, env], total, self.next_state[end, env]
         return *states, factor, self.next_allowed[end, env]
+
+
+def distinct(rows: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+    """The distinct ones of float32 `rows` [B, D], [U, D], and for each row which of them it is, int64 [B]."""
+    whole = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.itemsize * rows.shape[1]))).ravel()
+    _, first, which = np.unique(whole, return_index=True, return_inverse=True)
+    return torch.from_numpy(rows[first]), torch.from_numpy(which)

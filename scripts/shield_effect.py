@@ -25,7 +25,7 @@ from nesy.run_folder import RunFolder
 from nesy.world_model import SymbolicCodec, load_world_model
 from planners.agents import Agent, DQNAgent, PlanningAgent
 from planners.config import DQNConfig, SearchConfig
-from planners.dqn import train
+from planners.dqn import Training, train
 from planners.evaluation import Player, evaluate
 from planners.ialm import IALM
 from planners.perception import Perception
@@ -129,7 +129,7 @@ def main() -> None:
     if "dqn" in options.agents:
         for trained, training_mask in (("free", None), ("shielded", mask)):
             watch = Watch(domain)
-            policy, columns = train(
+            training = Training(
                 _watched(domain, watch),
                 codec,
                 "full",
@@ -137,9 +137,9 @@ def main() -> None:
                 "paper",
                 DQNConfig.fast(options.episodes),
                 options.seed,
-                progress,
                 training_mask,
             )
+            policy, columns = train(training, progress)
             results[f"dqn training {trained}"] = {
                 "steps": watch.steps,
                 "into_walls": watch.into_walls,

@@ -12,7 +12,7 @@ from domains.core import FORWARD, load_domain
 from nesy.errors import UserError
 from planners.config import DQNConfig
 from planners.dqn import DQNPolicy, Training, ValueNetwork, features, train
-from planners.memory import Replay
+from planners.memory import Replay, distinct
 from planners.perception import Percepts
 
 
@@ -118,7 +118,7 @@ def _trained(
     influence: str = "random", config: DQNConfig = TINY, **options: Any
 ) -> tuple[dict[str, Any], list[np.ndarray]]:
     codec: Any = SumCodec()
-    policy, episodes = train(load_domain(), codec, "paper", influence, "paper", config, 3, **options)
+    policy, episodes = train(Training(load_domain(), codec, "paper", influence, "paper", config, 3), **options)
     return episodes, [value.detach().numpy() for value in policy.network.parameters()]
 
 
@@ -178,3 +178,10 @@ def test_switches_of_the_published_code() -> None:
     assert published.published_sampling
     assert not _same(plain, _trained("perfect-information", replace(TINY, fallback="mode")))
     assert not _same(plain, _trained("perfect-information", replace(TINY, target_period=5)))
+
+
+def test_repeats_in_a_batch_are_found_to_the_last_bit() -> None:
+    rows = np.array([[0.0, 1.0], [0.5, 2.0], [0.0, 1.0], [np.nextafter(np.float32(0.5), 1), 2.0]], np.float32)
+    some, which = distinct(rows)
+    assert len(some) == 3
+    np.testing.assert_array_equal(some.numpy()[which.numpy()], rows)
