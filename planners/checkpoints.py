@@ -6,6 +6,7 @@ that was perceived: who resumes takes them again. Only what learning made is sto
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from nesy.errors import UserError
 from nesy.run_folder import atomic_path
 
 
@@ -46,15 +48,21 @@ def save_checkpoint(
         tensors |= {f"{name}.{key}": value for key, value in network.state_dict().items()}
     for index, moments in optimiser.state_dict()["state"].items():
         tensors |= {f"optimiser.{index}.{key}": value for key, value in moments.items()}
-    metadata = {"fingerprint": fingerprint, "state": json.dumps(checkpoint.state)}
+    tensors = {key: value.contiguous() for key, value in tensors.items()}
+    state = json.dumps(checkpoint.state)
+    metadata = {"fingerprint": fingerprint, "state": state, "sha256": _digest(tensors, state)}
     with atomic_path(path) as temporary:
-        save_file({key: value.contiguous() for key, value in tensors.items()}, str(temporary), metadata=metadata)
+        save_file(tensors, str(temporary), metadata=metadata)
 
 
 def load_checkpoint(
     path: Path, fingerprint: str, networks: dict[str, nn.Module], optimiser: torch.optim.Optimizer
 ) -> Checkpoint | None:
-    """Restore networks and optimiser in place; None where there is no whole checkpoint of this training."""
+    """Restore networks and optimiser in place; None where there is no whole checkpoint of this training.
+
+    Raises:
+        UserError: the file is whole, but does not fit these networks.
+    """
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -63,15 +71,31 @@ def load_checkpoint(
             if metadata.get("fingerprint") != fingerprint:
                 return None
             tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
+        if metadata["sha256"] != _digest(tensors, metadata["state"]):
+            return None
         state = json.loads(metadata["state"])
-    except (OSError, SafetensorError, KeyError, ValueError):
-        return None  # none yet, or cut off: the training starts anew
-    for name, network in networks.items():
-        network.load_state_dict({key: tensors[f"{name}.{key}"] for key in network.state_dict()})
-    moments: dict[int, dict[str, torch.Tensor]] = {}
-    for name, value in tensors.items():
-        if name.startswith("optimiser."):
-            _, index, key = name.split(".", 2)
-            moments.setdefault(int(index), {})[key] = value
-    optimiser.load_state_dict({"state": moments, "param_groups": optimiser.state_dict()["param_groups"]})
-    return Checkpoint(tensors["actions"].numpy(), tensors["priorities"].numpy(), state)
+    except (OSError, SafetensorError, KeyError, ValueError, RuntimeError):
+        return None  # none yet, cut off or damaged: the training starts anew
+    try:
+        for name, network in networks.items():
+            network.load_state_dict({key: tensors[f"{name}.{key}"] for key in network.state_dict()})
+        moments: dict[int, dict[str, torch.Tensor]] = {}
+        for name, value in tensors.items():
+            if name.startswith("optimiser."):
+                _, index, key = name.split(".", 2)
+                moments.setdefault(int(index), {})[key] = value
+        optimiser.load_state_dict({"state": moments, "param_groups": optimiser.state_dict()["param_groups"]})
+        return Checkpoint(tensors["actions"].numpy(), tensors["priorities"].numpy(), state)
+    except (KeyError, ValueError, TypeError, RuntimeError) as error:
+        reason = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+        raise UserError(f"{path}: not a checkpoint of this training ({reason}); delete it to train anew") from None
+
+
+def _digest(tensors: dict[str, torch.Tensor], state: str) -> str:
+    """Of everything a checkpoint holds: safetensors would not notice a changed byte."""
+    digest = hashlib.sha256(state.encode())
+    for name in sorted(tensors):
+        array = tensors[name].numpy()
+        digest.update(f"{name} {array.dtype} {array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()

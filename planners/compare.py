@@ -128,11 +128,11 @@ def compare(
     for variant in config.variants:
         if any(cell.agent in settings.PLANNING_AGENTS for cell in cells):
             ensure_ialm(run, domain, variant, config.search, seed, progress)
-    missing = [cell for cell in cells if not _is_done(run, config, cell, seed)]
+    missing = [cell for cell in cells if _result(run, config, cell, seed) is None]
     total = sum(_episodes(config, cell) for cell in missing)
     with progress.task("compare", total) as task:
         run_cells([(cell, run.path, config, seed, domain_name) for cell in missing], jobs, task, engine, address)
-    tables = [pq.read_table(cell_path(run, cell)) for cell in cells]
+    tables = [pq.read_table(cell_path(run, cell), page_checksum_verification=True) for cell in cells]
     whole = pa.concat_tables(tables, promote_options="default").replace_schema_metadata(None)
     with atomic_path(run.results / "episodes.parquet") as temporary:
         pq.write_table(whole, temporary, compression="zstd")
@@ -205,7 +205,7 @@ def run_cell(
     table = pa.concat_tables([*tables, _table(cell, "eval", results)], promote_options="default")
     table = table.replace_schema_metadata({"fingerprint": fingerprint})
     with atomic_path(cell_path(run, cell)) as temporary:
-        pq.write_table(table, temporary, compression="zstd")
+        pq.write_table(table, temporary, compression="zstd", write_page_checksum=True)
     checkpoint.unlink(missing_ok=True)
 
 
@@ -250,13 +250,14 @@ def _fingerprint(config: CompareConfig, cell: Cell, seed: int) -> str:
     return hashlib.sha256(json.dumps(relevant, sort_keys=True).encode()).hexdigest()
 
 
-def _is_done(run: RunFolder, config: CompareConfig, cell: Cell, seed: int) -> bool:
-    fingerprint = _fingerprint(config, cell, seed)
+def _result(run: RunFolder, config: CompareConfig, cell: Cell, seed: int) -> pa.Table | None:
+    """The episodes that a cell has left; None where it is to be run (again): none yet, of other settings, damaged."""
     try:
-        metadata = pq.read_schema(cell_path(run, cell)).metadata or {}
+        table = pq.read_table(cell_path(run, cell), page_checksum_verification=True)
     except (OSError, pa.ArrowException):
-        return False  # missing, or cut off: run it again
-    return metadata.get(b"fingerprint", b"").decode() == fingerprint
+        return None
+    metadata = table.schema.metadata or {}
+    return table if metadata.get(b"fingerprint") == _fingerprint(config, cell, seed).encode() else None
 
 
 def _table(cell: Cell, phase: str, columns: Columns) -> pa.Table:

@@ -64,7 +64,7 @@ def write_results(
 def map_optimum(folder: Path, domain: Domain, variant: str) -> Optimum | None:
     """Return and success of the exact optimum, by map too; worked out once and kept. None where it is out of reach."""
     path = folder / f"optimum-{variant}.json"
-    if path.is_file() and "maps" in (kept := read_json(path)):
+    if path.is_file() and _is_optimum(kept := read_json(path)):
         return dict(kept)
     try:
         oracle = domain.optimum(variant)
@@ -83,6 +83,20 @@ def map_optimum(folder: Path, domain: Domain, variant: str) -> Optimum | None:
     value = {"mean_return": oracle.mean_return, "success": oracle.success, "maps": maps}
     write_json(path, value)
     return value
+
+
+def _is_optimum(value: Any) -> bool:
+    """Whether a file holds what `map_optimum` writes; else it is worked out again."""
+    return (
+        isinstance(value, dict)
+        and all(isinstance(value.get(key), int | float) for key in ("mean_return", "success"))
+        and isinstance(value.get("maps"), list)
+        and all(
+            isinstance(entry, dict)
+            and all(isinstance(entry.get(k), int | float) for k in ("map_id", "return", "success"))
+            for entry in value["maps"]
+        )
+    )
 
 
 def _groups(episodes: pa.Table, phase: str) -> dict[tuple[str, ...], dict[str, np.ndarray]]:

@@ -69,6 +69,19 @@ def killing(ready: Callable[[], bool], kills: int) -> Iterator[list[int]]:
         thread.join()
 
 
+def test_a_damaged_result_is_worked_out_again(tmp_path: Path) -> None:
+    run = RunFolder(tmp_path / "run")
+    compare(run, REFERENCES, jobs=1)
+    good = rows(run)
+    damaged = sorted((run.results / "cells").glob("*.parquet"))[0]
+    content = bytearray(damaged.read_bytes())
+    content[len(content) // 4] ^= 255  # in the midst of the columns: the footer still reads well
+    damaged.write_bytes(content)
+    compare(run, REFERENCES, jobs=1)
+    assert rows(run) == good
+    assert damaged.read_bytes() != content
+
+
 def test_killed_workers_change_nothing(tmp_path: Path) -> None:
     undisturbed, disturbed = RunFolder(tmp_path / "undisturbed"), RunFolder(tmp_path / "disturbed")
     compare(undisturbed, REFERENCES, jobs=1)
