@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 from domains.core import Domain, load_domain
 from nesy.errors import UserError
 from nesy.progress import SILENT, Progress
-from nesy.run_folder import RunFolder, atomic_path, read_json
+from nesy.run_folder import RunFolder, atomic_path, read_json, write_json
 from planners import config as settings
 from planners.config import CompareConfig, SearchConfig
 from planners.evaluation import Columns, evaluate, outcome_names
@@ -132,12 +132,33 @@ def compare(
     total = sum(_episodes(config, cell) for cell in missing)
     with progress.task("compare", total) as task:
         run_cells([(cell, run.path, config, seed, domain_name) for cell in missing], jobs, task, engine, address)
+    _report_influence_rules(run, config, domain, cells)
     tables = [pq.read_table(cell_path(run, cell), page_checksum_verification=True) for cell in cells]
     whole = pa.concat_tables(tables, promote_options="default").replace_schema_metadata(None)
     with atomic_path(run.results / "episodes.parquet") as temporary:
         pq.write_table(whole, temporary, compression="zstd")
     optima = {variant: map_optimum(run.results, domain, variant) for variant in config.variants}
     return write_results(run.results, whole, config, optima)
+
+
+def _report_influence_rules(run: RunFolder, config: CompareConfig, domain: Domain, cells: list[Cell]) -> None:
+    """results/influence_rules.json: what rules about the person changed in the planners' influence, per variant."""
+    path = run.results / "influence_rules.json"
+    planning = {cell.variant for cell in cells if cell.agent in settings.PLANNING_AGENTS}
+    if not config.rules or not planning:
+        path.unlink(missing_ok=True)
+        return
+    from nesy.world_model import SymbolicCodec, load_world_model
+    from planners.ialm import IALM
+    from planners.influence_rules import constrain_influence
+
+    codec = SymbolicCodec(load_world_model(run.world_model))
+    rules = [Path(rule) for rule in config.rules]
+    changes = {}
+    for variant in sorted(planning):
+        _, change = constrain_influence(IALM.load(ialm_folder(run, variant)), rules, codec, domain)
+        changes[variant] = None if change is None else change.to_dict()
+    write_json(path, changes)
 
 
 def ensure_ialm(

@@ -48,7 +48,7 @@ class DecisionTable:
         ordered: bool [nodes], "<=" rather than "==".
         yes, no: int32 [nodes], where to go on.
         moments: float64 [nodes, M]. Distribution: counts per class. Mean: (n, sum, sum of squares).
-        kind: "distribution" or "mean".
+        kind: "distribution", "mean", or "given": probabilities in place of counts, which are taken as they stand.
         names: {slot: name}, for printing.
     """
 
@@ -75,6 +75,8 @@ class DecisionTable:
 
         A distribution is drawn towards that of the node above by `smoothing` counts, so that no row says never.
         """
+        if self.kind == "given":
+            return self.moments
         out = np.zeros_like(self.moments)
         for node in range(len(self.slot)):
             if self.kind == "mean":
@@ -89,6 +91,10 @@ class DecisionTable:
                     total = self.moments[child].sum()
                     out[child] = (self.moments[child] + smoothing * out[node]) / (total + smoothing)
         return out
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays to be stored."""
+        return {part: getattr(self, part) for part in ("slot", "value", "ordered", "yes", "no", "moments")}
 
     def locate(self, variables: np.ndarray) -> np.ndarray:
         """The row of each vector of variables: int [n, slots] -> int64 [n]."""
@@ -139,7 +145,7 @@ def pack(tables: list[DecisionTable]) -> PackedTables:
     estimate = np.ones((int(sizes.sum()), width))
     for start, table in zip(root, tables, strict=True):
         values = table.estimates()
-        if table.kind == "distribution":
+        if table.kind != "mean":
             values = np.cumsum(values, axis=1)
             values[:, -1] = 1.0
         estimate[start : start + len(values), : values.shape[1]] = values

@@ -7,6 +7,7 @@ answered from memory. A shield that would leave no action says which rules confl
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,26 @@ from nesy.asp.sources import Source, read_sources
 from nesy.errors import UserError
 
 Fallback = Literal["all", "stay", "error"]
+
+
+@dataclass(frozen=True)
+class Role:
+    """Whose actions the rules are about, and what the rules call that one's situation."""
+
+    code: str
+    """Predicate of factor values: code(F,V)."""
+    view: str
+    """Predicate of what holds in the view: view(P)."""
+    forbidden: str
+    """The head that forbids an action."""
+    preferred: str
+    """The head that prefers an action; empty where none does."""
+    encoding: str
+    """File under encodings/."""
+
+
+ROBOT = Role("at", "now", "forbidden", "preferred", "shield.lp")
+PERSON = Role("person_code", "person_now", "person_forbidden", "", "person.lp")
 
 
 @dataclass(frozen=True)
@@ -54,6 +75,7 @@ class Shield:
         stay: str = "stay",
         time_limit: float = 10.0,
         memory_mb: int = 1024,
+        role: Role = ROBOT,
     ) -> None:
         """Check the rules in a process of their own, then ground them once.
 
@@ -68,10 +90,12 @@ class Shield:
             stay: name of the action that `stay` means.
             time_limit: seconds that checking the rules may take.
             memory_mb: memory that checking the rules may take.
+            role: whose actions: the robot's own, or those that the person is expected to take.
 
         Raises:
             UserError: a rule is wrong, or the rules do not ground within their limits.
         """
+        self.role = role
         self.action_names = tuple(action_names)
         self._actions = tuple(asp_name(name) for name in action_names)
         if fallback not in ("all", "stay", "error"):
@@ -85,21 +109,32 @@ class Shield:
         words = " ".join(source.text for source in self._sources)
         # only what some rule mentions can matter
         self.predicates = tuple(name for name in predicates if asp_name(name) in words)
-        self._uses_code = "at(" in words.replace(" ", "")
-        labelled = [_labelled(source) for source in self._sources]
-        programs = [*self._sources, _encoding()]
+        self._uses_code = re.search(rf"\b{role.code}\s*\(", words) is not None
+        labelled = [_labelled(source, role) for source in self._sources]
+        programs = [*self._sources, self._encoding()]
         solve(programs, self._situation_program(), (), time_limit=time_limit, memory_mb=memory_mb)
         self._ground(labelled)
+
+    @property
+    def speaks(self) -> bool:
+        """Whether some rule is about this role's actions at all."""
+        words = " ".join(source.text for source in self._sources)
+        return (
+            re.search(rf"\b({'|'.join(filter(None, (self.role.forbidden, self.role.preferred)))})\b", words) is not None
+        )
+
+    def _encoding(self) -> Source:
+        return Source(self.role.encoding, (ENCODINGS / self.role.encoding).read_text(encoding="utf-8"))
 
     def _ground(self, labelled: Sequence[str]) -> None:
         """Ground the rules in this process: they are known to be harmless by now."""
         self._control = clingo.Control(["--warn=none", "--models=1"])
-        for text in (*labelled, _encoding().text, self._situation_program()):
+        for text in (*labelled, self._encoding().text, self._situation_program()):
             self._control.add("base", [], text)
         self._control.ground([("base", [])])
         self._inputs = [
             (atom.literal, atom.symbol)
-            for name, arity in (("at", 2), ("now", 1), ("person", 3), ("unseen", 0))
+            for name, arity in ((self.role.code, 2), (self.role.view, 1), ("person", 3), ("unseen", 0))
             for atom in self._control.symbolic_atoms.by_signature(name, arity)
             if atom.is_external
         ]
@@ -114,17 +149,19 @@ class Shield:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        self._ground([_labelled(source) for source in self._sources])
+        self._ground([_labelled(source, self.role) for source in self._sources])
 
     def _situation_program(self) -> str:
         size = self.view_size
         num_factors, num_values = self._size
-        lines = [f"viewer({size // 2},{size - 1}).", "#external unseen."]
-        lines.append(f"#external person(X,Y,H) : X = 0..{size - 1}, Y = 0..{size - 1}, H = 0..3.")
-        lines += [f"#external now({asp_name(name)})." for name in self.predicates]
+        lines = [f"viewer({size // 2},{size - 1})."]
+        if self.role == ROBOT:
+            lines.append("#external unseen.")
+            lines.append(f"#external person(X,Y,H) : X = 0..{size - 1}, Y = 0..{size - 1}, H = 0..3.")
+        lines += [f"#external {self.role.view}({asp_name(name)})." for name in self.predicates]
         lines += [f"action({name})." for name in self._actions]
         if self._uses_code:
-            lines.append(f"#external at(F,V) : F = 0..{num_factors - 1}, V = 0..{num_values - 1}.")
+            lines.append(f"#external {self.role.code}(F,V) : F = 0..{num_factors - 1}, V = 0..{num_values - 1}.")
         return "\n".join(lines)
 
     def advise(self, code: np.ndarray, truth: np.ndarray, configuration: int) -> Advice:
@@ -168,8 +205,8 @@ class Shield:
     def constrain(self, probabilities: np.ndarray, mask: np.ndarray) -> np.ndarray:
         """A distribution over actions without the forbidden ones: knowledge from people as a prior.
 
-        With a shield over the person's actions ("a person facing a wall does not walk forward"), this constrains
-        the influence I(u | l).
+        With a shield over the person's actions (`PERSON`: "a person facing a wall does not walk forward"), this
+        constrains the influence I(u | l), see planners.influence_rules.
 
         Args:
             probabilities: float [B, A], rows sum to 1.
@@ -193,9 +230,10 @@ class Shield:
         return np.where(totals > 0, kept / np.where(totals > 0, totals, 1.0), uniform)
 
     def _ask(self, code: np.ndarray, truth: np.ndarray, configuration: int) -> Advice:
-        true = {clingo.Function("now", [clingo.Function(asp_name(self.predicates[p]))]) for p in np.flatnonzero(truth)}
+        view, at = self.role.view, self.role.code
+        true = {clingo.Function(view, [clingo.Function(asp_name(self.predicates[p]))]) for p in np.flatnonzero(truth)}
         if self._uses_code:
-            true |= {clingo.Function("at", [clingo.Number(f), clingo.Number(int(v))]) for f, v in enumerate(code)}
+            true |= {clingo.Function(at, [clingo.Number(f), clingo.Number(int(v))]) for f, v in enumerate(code)}
         if configuration == 0:
             true.add(clingo.Function("unseen"))
         else:
@@ -212,7 +250,7 @@ class Shield:
         return self._advice(shown)
 
     def _advice(self, shown: Sequence[clingo.Symbol]) -> Advice:
-        said: dict[str, set[str]] = {"forbidden": set(), "preferred": set()}
+        said: dict[str, set[str]] = {self.role.forbidden: set(), self.role.preferred: set()}
         places: dict[str, list[str]] = {}
         for symbol in shown:
             if symbol.name == "because":
@@ -220,7 +258,7 @@ class Shield:
                 places.setdefault(str(action), []).append(place.string)
             else:
                 said[symbol.name].add(str(symbol.arguments[0]))
-        forbidden = said["forbidden"]
+        forbidden = said[self.role.forbidden]
         allowed = tuple(action not in forbidden for action in self._actions)
         because = {
             name: tuple(sorted(places.get(action, ())))
@@ -233,15 +271,11 @@ class Shield:
                 every = sorted({place for found in because.values() for place in found})
                 raise UserError(f"the shield leaves no action; these rules conflict: {', '.join(every)}")
             allowed = tuple(self.fallback == "all" or name == self._stay for name in self.action_names)
-        preferred = tuple(action in said["preferred"] for action in self._actions)
+        preferred = tuple(action in said[self.role.preferred] for action in self._actions)
         return Advice(allowed, preferred, because, conflict)
 
 
-def _encoding() -> Source:
-    return Source("shield.lp", (ENCODINGS / "shield.lp").read_text(encoding="utf-8"))
-
-
-def _labelled(source: Source) -> str:
+def _labelled(source: Source, role: Role) -> str:
     """The rules, and for each that forbids an action one that says where it stands."""
     lines: list[str] = []
 
@@ -253,7 +287,7 @@ def _labelled(source: Source) -> str:
         if atom.ast_type != ast.ASTType.SymbolicAtom or statement.head.sign != ast.Sign.NoSign:
             return
         term = atom.symbol
-        if term.ast_type != ast.ASTType.Function or term.name != "forbidden" or len(term.arguments) != 1:
+        if term.ast_type != ast.ASTType.Function or term.name != role.forbidden or len(term.arguments) != 1:
             return
         begin = statement.location.begin
         place = f"{source.name}:{begin.line}:{begin.column}".replace("\\", "\\\\").replace('"', '\\"')

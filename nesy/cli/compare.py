@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from nesy.cli import pipeline, tables
+from nesy.run_folder import read_json
 from planners.config import CompareConfig
 
 
@@ -30,9 +31,16 @@ def defaults(arguments: list[str]) -> Arguments:
 def run(options: Arguments) -> dict[str, Any]:
     """Run the cells of the grid that the run folder does not hold yet."""
     with pipeline.opened(options, "compare", compare=options.settings) as steps:
-        return steps.compare(options.engine, options.address)
+        result = steps.compare(options.engine, options.address)
+        path = steps.run.results / "influence_rules.json"
+        return result | ({"influence_rules": read_json(path)} if path.is_file() else {})
 
 
 def show(result: dict[str, Any]) -> None:
-    """Print the comparison table."""
+    """Print the comparison table, and what rules about the person changed."""
     tables.print_comparison(result["comparison"])
+    for variant, change in result.get("influence_rules", {}).items():
+        if change is not None:
+            share = f"{change['constrained']} of {change['codes']} known codes"
+            chance = f"{change['removed']:.2g} on average, {change['most']:.2g} at most"
+            print(f"{variant}: rules about the person exclude moves for {share}; these had a probability of {chance}")
