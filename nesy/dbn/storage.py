@@ -19,7 +19,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from nesy.errors import UserError
-from nesy.run_folder import atomic_path
+from nesy.run_folder import atomic_path, parse_json
 
 _LOCAL_HEADER = 30  # bytes of a zip member's local header before its name
 
@@ -80,17 +80,24 @@ def _seal(document: dict[str, Any]) -> bytes:
 def _read_sealed(path: Path, kind: str) -> dict[str, Any]:
     content = _read_bytes(path)
     try:
-        document = json.loads(content.decode("utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        document = parse_json(content.decode("utf-8"))
+    except (ValueError, RecursionError) as error:
         raise UserError(f"{path}: not valid JSON ({error})") from None
     if not isinstance(document, dict) or document.get("format") != kind:
         raise UserError(f"{path}: not a {kind} file")
-    if document.pop("checksum", None) is None or _seal(document) != content:
+    if document.pop("checksum", None) is None or not _is_sealed(document, content):
         raise UserError(f"{path}: damaged (its checksum does not match its content); extract the model again")
     tables = document.get("tables")
     if not (isinstance(tables, dict) and isinstance(tables.get("file"), str) and isinstance(tables.get("sha256"), str)):
         raise UserError(f"{path}: does not name its table file")
     return document
+
+
+def _is_sealed(document: dict[str, Any], content: bytes) -> bool:
+    try:
+        return _seal(document) == content
+    except ValueError:  # half a surrogate pair: nothing that we would have written
+        return False
 
 
 def _read_bytes(path: Path) -> bytes:

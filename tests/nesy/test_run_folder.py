@@ -61,3 +61,12 @@ def test_open_tells_what_is_wrong(tmp_path: Path) -> None:
 def test_require_names_the_command(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="nesy train --run"):
         RunFolder(tmp_path).require("train")
+
+
+@pytest.mark.parametrize("text", ["1" + "0" * 5000, str(2**63), "[NaN]", "-Infinity", '{"a": ' * 100_000])
+def test_json_beyond_what_we_write_is_one_clear_line(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "it.json"
+    path.write_text(text)
+    with pytest.raises(UserError, match="not valid JSON") as caught:
+        read_json(path)
+    assert len(str(caught.value)) < 1000
