@@ -85,7 +85,7 @@ def main(arguments: Arguments) -> None:
         began = time.perf_counter()
         bounds = Limits(now=now, next=arcs, total=min(now + arcs, MOST_PARENTS), penalty=1.0)
         search = CodeSearch(Refiner(transitions, 8, 4, bounds), questions, 8, named, config.train.headline)
-        search.start(rng.normal(size=(transitions.num_views, 8, 8)), rng)
+        search.start(rng)
         book = search.search(max(3, round(arguments.epochs / 6)), max(4, round(arguments.epochs / 2)), rng)
         count, _, _ = book.structure.arrays()
         seconds = time.perf_counter() - began

@@ -5,11 +5,12 @@
    give up theirs. Their values are refined entry by entry until codes are distinct and predict the next code
    (`refinement.py`); a value still costs what it fails to tell about the questions that its factor knows best.
 
-Without named factors the second step starts from the encoder's codes.
+Without named factors the second step starts from random codes.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,28 +22,43 @@ from nesy.world_model.refinement import CodeBook, Refiner, separate
 from nesy.world_model.structure import Structure
 from nesy.world_model.telling import telling_cost
 
-NOISE = 12.0
-"""Annealing temperature of the refinement at its start, in nats."""
-SWEEPS = 2
-"""Passes over the code book per round of refinement."""
-MOVES = 1500
-"""Moves tried in a round of questions."""
+MOVES, SWEEPS = 1500, 2
+"""Moves tried in a round of questions; passes over the code book in a round of refinement."""
 HOT, COLD = 0.02, 0.001
 """Temperatures of the questions in their first and their last but one round, nats per transition; then 0."""
-COLLISION = 1.0
-"""Price in the first step of a nat that the codes do not say about the view; completing factors add it later."""
-ADJUSTING, WARM, NEVER = 300, 0.001, 1e3
-"""Moves of the questions in a round of the second step, their temperature at its start, and what makes codes stay
-distinct."""
-MEANING = 1.0
-"""Nats of cost per nat that a value of a completing factor fails to tell about a view."""
+WARM, NEVER = 0.001, 1e3
+"""Temperature of the questions at the start of the second step, and what makes codes stay distinct there."""
+QUIET = 0.8
+"""Share of the rounds of the second step after which there is no noise."""
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """What the search is made of; scripts/ablations.py leaves out one at a time."""
+
+    noise: float = 12.0
+    """Annealing temperature of the refinement at its start, in nats."""
+    collision: float = 1.0
+    """Price in the first step of a nat that codes do not say about the view; completing factors add it later."""
+    adjusting: int = 300
+    """Moves of the questions in a round of the second step."""
+    meaning: float = 1.0
+    """Nats of cost per nat that a value of a completing factor fails to tell about a view."""
+    told: float = 0.005
+    """Bonus of a question that one factor answers: nats per transition for each nat of its entropy over the views."""
 
 
 class CodeSearch:
     """Both steps, round by round; all state goes through `state` and `restore`."""
 
     def __init__(
-        self, refiner: Refiner, questions: Questions, num_factors: int, named: int, headline: tuple[str, ...]
+        self,
+        refiner: Refiner,
+        questions: Questions,
+        num_factors: int,
+        named: int,
+        headline: tuple[str, ...],
+        settings: SearchSettings | None = None,
     ) -> None:
         """Prepare the search.
 
@@ -52,22 +68,25 @@ class CodeSearch:
             num_factors: N.
             named: how many factors keep their questions.
             headline: questions that the first named factor asks in any case.
+            settings: of the search.
         """
+        self.settings = settings or SearchSettings()
         self.refiner, self.questions, self.num_factors = refiner, questions, num_factors
         self.named = named if questions.names else 0
         self.completing = list(range(num_factors - self.named))
         self.asking = list(range(num_factors - self.named, num_factors))
         fixed = {num_factors - self.named: headline} if self.named else {}
-        self._search = GroupSearch(questions, refiner, fixed)
+        self._search = GroupSearch(questions, refiner, fixed, self.settings.told)
         self.groups: np.ndarray | None = None
         self.book: CodeBook | None = None
 
-    def start(self, logits: np.ndarray, rng: np.random.Generator) -> None:
-        """Begin: with random questions, or from an encoder's logits [V, N, K] where no factor is to be named."""
+    def start(self, rng: np.random.Generator) -> None:
+        """Begin: with random questions, or with random codes where no factor is to be named."""
         if self.named:
             self.groups, self.book = self._search.start(self.num_factors, rng)
         else:
-            self.book = self.refiner.search(separate(logits))
+            shape = (self.refiner.transitions.num_views, self.num_factors, self.refiner.num_values)
+            self.book = self.refiner.search(separate(rng.normal(size=shape)))
 
     def questions_round(self, done: float, rng: np.random.Generator) -> dict[str, Any]:
         """One round of the first step; `done` is 1 in the last one."""
@@ -75,10 +94,10 @@ class CodeSearch:
         temperature = HOT * (COLD / HOT) ** done if done < 1 else 0.0
         everyone = list(range(self.num_factors))
         self.groups, self.book, made = self._search.improve(
-            self.groups, self.book, everyone, MOVES, temperature, COLLISION, rng
+            self.groups, self.book, everyone, MOVES, temperature, self.settings.collision, rng
         )
         distinct = len(np.unique(self.book.codes, axis=0))
-        return {"next_code_nll": self.book.nll, "distinct_codes": distinct, "moved": made}
+        return {"counted_nll": self.book.nll, "distinct_codes": distinct, "moved": made}
 
     def separate(self) -> None:
         """End of the first step: make the codes distinct, by the completing factors as far as they can."""
@@ -91,16 +110,17 @@ class CodeSearch:
     def codes_round(self, done: float, rng: np.random.Generator) -> dict[str, Any]:
         """One round of the second step; the noise ends at 80 % of the rounds."""
         assert self.book is not None
-        noise = NOISE * max(0.0, 1.0 - done / 0.8)
-        cost = MEANING * telling_cost(self.questions.answers, self.book.codes, self.completing, self.refiner.num_values)
+        settings, loud = self.settings, max(0.0, 1.0 - done / QUIET)
+        noise, codes = settings.noise * loud, self.book.codes
+        cost = settings.meaning * telling_cost(self.questions.answers, codes, self.completing, self.refiner.num_values)
         self.book, moved = self.refiner.refine(self.book, cost, noise, SWEEPS, rng, self.completing)
-        if self.groups is not None:
-            temperature = WARM * max(0.0, 1.0 - done / 0.8)
+        if self.groups is not None and settings.adjusting:
+            temperature = WARM * loud
             self.groups, self.book, adjusted = self._search.improve(
-                self.groups, self.book, self.asking, ADJUSTING, temperature, NEVER, rng
+                self.groups, self.book, self.asking, settings.adjusting, temperature, NEVER, rng
             )
             moved += adjusted
-        return {"next_code_nll": self.book.nll, "moved": moved, "noise": noise}
+        return {"counted_nll": self.book.nll, "moved": moved, "noise": noise}
 
     def search(self, questions_rounds: int, codes_rounds: int, rng: np.random.Generator) -> CodeBook:
         """Both steps after `start`, all rounds."""

@@ -15,8 +15,9 @@ import torch
 from nesy.world_model.codec import SymbolicCodec
 from nesy.world_model.distinct import Transitions
 from nesy.world_model.networks import SymbolicWorldModel, WorldModel
+from nesy.world_model.refinement import CodeBook
 from nesy.world_model.successors import most_probable
-from nesy.world_model.tables import log_probability
+from nesy.world_model.tables import all_tables, log_probability
 
 # How far a model may stay behind the limit of the data and still pass.
 MARGIN_NLL, MARGIN_EXACT, MARGIN_CELLS = 0.135, 0.028, 0.01
@@ -102,6 +103,24 @@ def next_gates(codec: SymbolicCodec, transitions: Transitions) -> dict[str, floa
         "next_view_cells": float((weight * same.mean(1)).sum() / weight.sum()),
         "inverse_accuracy": float((weight * (inferred == t.action)).sum() / weight.sum()),
     }
+
+
+def book_nll(book: CodeBook, counted: Transitions, asked: Transitions, place: np.ndarray, num_values: int) -> float:
+    """Nats that it takes to say the next code of `asked` under tables counted from `counted`, per transition.
+
+    Args:
+        book: codes of the views of `counted`, and the structure of the tables.
+        counted: what the tables are counted from.
+        asked: what is to be said.
+        place: int [V], the index of every view of `asked` among those of `counted`.
+        num_values: K.
+    """
+    codes, c = book.codes, counted
+    tables = all_tables(book.structure, codes[c.source], c.action, codes[c.target], c.weight, num_values)
+    codes = codes[place]
+    before, after = codes[asked.source], codes[asked.target]
+    logs = log_probability(book.structure, tables, before, asked.action, after, num_values)
+    return float(-(asked.weight * logs).sum() / asked.weight.sum())
 
 
 def infer_actions(codec: SymbolicCodec, before: np.ndarray, after: np.ndarray) -> np.ndarray:

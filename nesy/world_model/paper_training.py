@@ -40,6 +40,7 @@ class PaperTrainer:
         columns: Columns,
         apart: np.ndarray,
         held_out: Transitions | None,
+        reference: Transitions,
     ) -> None:
         """Prepare the training.
 
@@ -50,9 +51,10 @@ class PaperTrainer:
             columns: the steps.
             apart: bool [M], the maps kept out of training.
             held_out: the transitions on those; None where there are none.
+            reference: what the gates are computed on, beside held-out maps.
         """
         self.config, self.seed, self.everything, self.held_out = config, seed, everything, held_out
-        self.columns, self.apart = columns, apart
+        self.columns, self.apart, self.reference = columns, apart, reference
         self.rows = columns.rows(~apart)
         self.device = torch.device(config.device)
         self.generator = torch.Generator().manual_seed(seed)
@@ -89,7 +91,7 @@ class PaperTrainer:
                 totals[name] = totals.get(name, torch.zeros((), device=self.device)) + value.detach() / STEPS
         self.epoch += 1
         codec = SymbolicCodec(self.model)
-        gates = evaluate(codec, self.everything)
+        gates = evaluate(codec, self.reference, self.everything.views)
         figures, holds = gates, all(gates["passed"].values())
         if self.held_out is not None:
             figures = evaluate(codec, self.held_out)

@@ -6,7 +6,7 @@ the value of a view never met follows from its answers.
 
 The groups are found by simulated annealing. A move adds a question to a group, takes one out, or exchanges one. It
 is judged by what it takes to say the next view, in nats: the next code under the 2DBN, the view given its code, and
-a bonus for every question that some factor answers (`TOLD`).
+a bonus for every question that some factor answers.
 """
 
 from __future__ import annotations
@@ -23,8 +23,6 @@ from nesy.world_model.refinement import CodeBook, Refiner
 
 MOST_QUESTIONS = 8
 """Questions in one group at most."""
-TOLD = 0.005
-"""Bonus of a question that one factor answers: nats per transition for each nat of its entropy over the views."""
 FEWEST = 20
 """Weight that every view has at least where views are told apart, in transitions."""
 PROPOSALS = 12
@@ -102,19 +100,21 @@ class _Search(NamedTuple):
 class GroupSearch:
     """Finds the groups; all state is in the groups and the code book."""
 
-    def __init__(self, questions: Questions, refiner: Refiner, fixed: dict[int, tuple[str, ...]]) -> None:
+    def __init__(self, questions: Questions, refiner: Refiner, fixed: dict[int, tuple[str, ...]], told: float) -> None:
         """Prepare a search.
 
         Args:
             questions: what can be asked.
             refiner: of the transitions; its structure search is used.
             fixed: questions that a factor must keep; those with one answer only are left out.
+            told: bonus of a question that one factor answers: nats per transition for each nat of its entropy.
         """
         self.questions, self.refiner = questions, refiner
         t = refiner.transitions
         mass = np.bincount(t.target, t.weight, minlength=t.num_views)
         self._mass = np.maximum(mass, FEWEST).astype(np.int64)
         self._total = float(t.weight.sum())
+        self._bonus = told * self._total * questions.entropy()
         known = {name: place for place, name in enumerate(questions.names)}
         self._fixed = {i: [known[name] for name in names if name in known] for i, names in fixed.items()}
 
@@ -172,11 +172,10 @@ class GroupSearch:
             _answered(answers, search.codes[:, i], refiner.num_values, search.told[i])
         _place(1, np.ones(num_views, dtype=np.bool_), search, self._mass, refiner.num_values, refiner.logs)
         kept = np.array([len(self._fixed.get(i, [])) for i in range(num_factors)], dtype=np.int64)
-        bonus = TOLD * self._total * self.questions.entropy()
         proposals = rng.random((PROPOSALS * moves, 6))
         made = _anneal(
-            proposals, np.array(factors, dtype=np.int64), moves, temperature * self._total, collision, bonus, kept,
-            answers, self._mass, search, refiner.edges, families, counts, refiner.num_values,
+            proposals, np.array(factors, dtype=np.int64), moves, temperature * self._total, collision, self._bonus,
+            kept, answers, self._mass, search, refiner.edges, families, counts, refiner.num_values,
         )  # fmt: skip
         return search.groups, refiner.search(search.codes, book.structure), int(made)
 

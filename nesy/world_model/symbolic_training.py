@@ -1,16 +1,15 @@
-"""Training of the `symbolic` architecture, in four stages.
+"""Training of the `symbolic` architecture.
 
-1. `network`: encoder, decoder, inverse model and an autoregressive forward guide are trained together on
-   `L = L_VAE + L_forward + L_inverse` with straight-through Gumbel samples of a falling temperature, less a
-   bonus for using all values. Only maps that are not held out are learned from; the figures on held-out maps are
-   those at the end of this stage.
-2. `questions` and 3. `codes` (where the distinct views are few): a code book is searched whose named factors answer
-   questions about the view, and whose other factors make codes distinct and the next code predictable
-   (`code_search.py`).
-4. `fit`: encoder, decoder and inverse model learn the code book, until every view is encoded to its code and rebuilt
-   exactly. The tables are then counted from the encoder's own codes.
+1. `questions` and 2. `codes`: a code book is searched whose named factors answer questions about the view, and whose
+   other factors make codes distinct and the next code predictable (`code_search.py`). Only steps on maps that are
+   not held out count.
+3. `fit`: encoder, decoder and inverse model learn the codes of the views met on those maps, until each is encoded to
+   its code and rebuilt exactly. The gates on held-out maps are those of this stage.
+4. `complete`: the views met nowhere but on held-out maps, or by nobody, are learned too. The tables are then counted
+   from all steps, in the encoder's own codes.
 
-Where views are many, stages 2 and 3 are left out and the last stage goes on as the first without noise.
+Where views are too many to search a code book (`REFINE_UP_TO`), two stages of gradients alone take the place of all
+these: `network`, with noise that fades (`autoencoding.py`), and `fit`, without.
 """
 
 from __future__ import annotations
@@ -21,19 +20,21 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from domains.core import PredicateVocabulary
 from nesy.config import TrainConfig
 from nesy.world_model import losses
+from nesy.world_model.autoencoding import Autoencoding, ForwardGuide, Ingredients
 from nesy.world_model.code_search import CodeSearch, structure_of
 from nesy.world_model.codec import SymbolicCodec
-from nesy.world_model.distinct import Transitions, view_keys
-from nesy.world_model.gates import limits, next_gates, view_gates
-from nesy.world_model.networks import SymbolicWorldModel, perceptron
+from nesy.world_model.distinct import Transitions
+from nesy.world_model.gates import evaluate, view_gates
+from nesy.world_model.held_out import HeldOut
+from nesy.world_model.networks import SymbolicWorldModel
 from nesy.world_model.questions import Questions
 from nesy.world_model.refinement import Refiner
-from nesy.world_model.structure import Limits
+from nesy.world_model.structure import Limits, Structure
 
 REFINE_UP_TO = 5000
 """Most distinct views for which codes are refined one by one."""
@@ -43,40 +44,18 @@ MOST_PARENTS = 5
 """Parents of a factor in both slices together: a table has `values ** MOST_PARENTS` rows at most."""
 LEARNING_SCALE = 0.3
 """Share of the configured step size that suits plain perceptrons."""
-USAGE_WEIGHT, FORWARD_WEIGHT, INVERSE_WEIGHT = 0.02, 0.1, 0.1
-FIT_EPOCHS = 120
-"""Epochs that the third stage may take at least."""
-PASSES = 4
-"""How often an epoch of the third stage shows every view."""
-
-
-class ForwardGuide(nn.Module):
-    """Predicts the next code factor by factor, later factors seeing the earlier ones; only used in training."""
-
-    mask: Tensor
-
-    def __init__(self, model: SymbolicWorldModel) -> None:
-        super().__init__()
-        self.sizes = (model.num_factors, model.num_values, model.num_actions)
-        code = model.num_factors * model.num_values
-        self.context = perceptron(code + model.num_actions, model.hidden, code)
-        self.earlier = nn.Linear(code, code, bias=False)
-        factor = torch.arange(code) // model.num_values
-        self.register_buffer("mask", (factor[:, None] > factor[None, :]).float())
-
-    def forward(self, belief: Tensor, action: Tensor, then: Tensor) -> Tensor:
-        """Logits [B, N, K] of the next code, given what really followed in earlier factors, `then` [B, N, K]."""
-        num_factors, num_values, num_actions = self.sizes
-        inputs = torch.cat([belief.flatten(1), F.one_hot(action.long(), num_actions).float()], 1)
-        logits = self.context(inputs) + F.linear(then.flatten(1), self.earlier.weight * self.mask)
-        shaped: Tensor = logits.view(-1, num_factors, num_values)
-        return shaped
+FIT_EPOCHS = 40
+"""Epochs that learning a code book may take at least: it is learned from scratch, whatever the number of epochs."""
+FIT_STEPS = 20
+"""Mini-batches in one of them at least."""
+PASSES = 8
+"""How often one of them shows every view."""
 
 
 class SymbolicTrainer:
     """One training run; `tick` does one epoch or one round, and all state goes through `state` and `restore`."""
 
-    stages = ("network", "questions", "codes", "fit")
+    stages = ("network", "questions", "codes", "fit", "complete")
 
     def __init__(
         self,
@@ -84,13 +63,27 @@ class SymbolicTrainer:
         seed: int,
         everything: Transitions,
         training: Transitions,
-        held_out: Transitions | None,
+        held_out: HeldOut | None,
         predicates: PredicateVocabulary | None = None,
+        reference: Transitions | None = None,
+        ingredients: Ingredients | None = None,
     ) -> None:
-        self.config, self.everything, self.held_out = config, everything, held_out
+        """Prepare the training.
+
+        Args:
+            config: how to learn.
+            seed: of everything random.
+            everything: all that was met, indexes every view.
+            training: what was met on maps that are not held out; indexes the same views.
+            held_out: what was met on the others.
+            predicates: to ask about views; by default the kinds of cells.
+            reference: what the gates are computed on at the end; `everything` by default.
+            ingredients: of the loss where views are many.
+        """
+        self.config, self.everything, self.training, self.held_out = config, everything, training, held_out
+        self.reference = everything if reference is None else reference
         self.refines = everything.num_views <= REFINE_UP_TO
-        self.training = training
-        self.final = everything if self.refines else training
+        self.ingredients = ingredients or Ingredients()
         self.device = torch.device(config.device)
         self.generator = torch.Generator().manual_seed(seed)
         with torch.random.fork_rng(devices=[]):
@@ -99,15 +92,15 @@ class SymbolicTrainer:
             self.guide = ForwardGuide(self.model)
         self.model.to(self.device)
         self.guide.to(self.device)
-        self.weights = losses.class_weights(training.views, np.maximum(training.visits, 0)).to(self.device)
+        self.autoencoding = Autoencoding(
+            self.model, self.guide, training, config.kl_weight, self.ingredients, self.generator
+        )
         self.optimizer = self._optimizer(config.learning_rate * LEARNING_SCALE)
         self.rng = np.random.default_rng(seed)
         arcs = 2 if config.intra_slice_arcs else 0
-        bounds = Limits(
+        self.bounds = Limits(
             now=config.max_parents, next=arcs, total=min(config.max_parents + arcs, MOST_PARENTS), penalty=1.0
         )
-        self.refiner = Refiner(self.final, self.model.num_values, self.model.num_actions, bounds)
-        self.train_refiner = Refiner(training, self.model.num_values, self.model.num_actions, bounds)
         self.search: CodeSearch | None = None
         if self.refines:
             questions = Questions.about_cells(everything.views)
@@ -115,10 +108,11 @@ class SymbolicTrainer:
                 truth = predicates.evaluate(everything.views)
                 questions = Questions.of(predicates.names, truth, config.headline)
             self.search = CodeSearch(
-                self.refiner, questions, self.model.num_factors, config.named_factors, config.headline
+                self._refiner(training), questions, self.model.num_factors, config.named_factors, config.headline
             )
         self.held_out_figures: dict[str, Any] = {}
-        self.stage, self.epoch, self.finished = "network", 0, False
+        self.epoch, self.finished = 0, False
+        self.stage = next(stage for stage in self.stages if self._rounds(stage) > 0)
         self.views = torch.as_tensor(everything.views, device=self.device)
 
     # ---------------------------------------------------------------- progress and time
@@ -127,133 +121,95 @@ class SymbolicTrainer:
         return sum(self._rounds(stage) for stage in self.stages)
 
     def _rounds(self, stage: str) -> int:
-        epochs, refines = self.config.epochs, self.refines
-        named = self.search is not None and self.search.named > 0
+        epochs = self.config.epochs
+        if self.search is None:
+            return epochs if stage in ("network", "fit") else 0
         return {
-            "network": epochs,
-            "questions": max(3, round(epochs / 6)) if named else 0,
-            "codes": max(4, round(epochs / 2)) if refines else 0,
-            # A refined code book is learned from scratch, which takes its time however little there was before.
-            "fit": max(epochs, FIT_EPOCHS) if refines else epochs,
+            "network": 0,
+            "questions": max(3, round(epochs / 6)) if self.search.named else 0,
+            "codes": max(4, round(epochs / 2)),
+            "fit": max(round(2 * epochs / 3), FIT_EPOCHS),
+            "complete": max(round(2 * epochs / 3), FIT_EPOCHS),
         }[stage]
 
     def deadline(self) -> float:
         """Seconds of the time limit after which the present stage must end."""
         if not self.config.time_limit:
             return math.inf
-        share = {"network": 0.3 if self.refines else 0.7, "questions": 0.6, "codes": 0.8, "fit": 0.97}[self.stage]
+        share = {"network": 0.7, "questions": 0.4, "codes": 0.8, "fit": 0.9, "complete": 0.97}[self.stage]
         return share * self.config.time_limit
 
     def tick(self, elapsed: float) -> dict[str, Any]:
         """Do one epoch or round; `elapsed` is the time used so far, in seconds."""
         stage = self.stage
-        figures = {
-            "network": self._network_epoch,
-            "questions": self._questions_round,
-            "codes": self._codes_round,
-            "fit": self._fit_epoch,
-        }[stage]()
+        self.model.train()
+        figures = self._network_epoch() if self.search is None else self._search_or_fit(self.search)
         self.epoch += 1
-        if self.epoch >= self._rounds(stage) or figures.pop("converged", False) or elapsed >= self.deadline():
+        settled = figures.pop("settled", False)
+        if settled or self.epoch >= self._rounds(stage) or elapsed >= self.deadline():
             self._end_stage()
         return {"stage": stage, **figures}
 
+    def _search_or_fit(self, search: CodeSearch) -> dict[str, Any]:
+        if search.book is None:
+            search.start(self.rng)
+        done = self.epoch / self._rounds(self.stage)
+        if self.stage in ("fit", "complete"):
+            return self._fit_epoch(done)
+        if self.stage == "questions":
+            figures = search.questions_round(self.epoch / (self._rounds("questions") - 1), self.rng)
+        else:
+            figures = search.codes_round(done, self.rng)
+        if self.held_out is not None and search.book is not None:
+            figures["next_code_nll"] = self.held_out.nll(search.book, self.model.num_values)
+        return figures
+
     def _end_stage(self) -> None:
-        if self.stage == "network":
-            self._measure_held_out()
-            if self.search is not None:
-                self.search.start(self._logits(), self.rng)
         if self.stage == "questions" and self.search is not None:
             self.search.separate()
-        if self.stage == "fit":
-            self._set_forward_model(self.final)
-            if not self.refines:
-                self._measure_held_out()
+        later = [s for s in self.stages[self.stages.index(self.stage) + 1 :] if self._rounds(s) > 0]
+        if not later:
+            if self.search is None:
+                self._set_forward_model(self.training)
+                if self.held_out is not None:
+                    self.held_out_figures = self.held_out.gates(SymbolicCodec(self.model))
             self.finished = True
             return
-        self.stage = next(
-            stage for stage in self.stages[self.stages.index(self.stage) + 1 :] if self._rounds(stage) > 0
-        )
-        self.epoch = 0
-        self.optimizer = self._optimizer(self.config.learning_rate * LEARNING_SCALE * (1.0 if self.refines else 0.3))
+        self.stage, self.epoch = later[0], 0
+        scale = LEARNING_SCALE * (1.0 if self.refines else 0.3)
+        self.optimizer = self._optimizer(self.config.learning_rate * scale)
 
-    # ---------------------------------------------------------------- stage 1
+    # ---------------------------------------------------------------- many views
     def _network_epoch(self) -> dict[str, Any]:
-        done = self.epoch / self.config.epochs
-        noise = max(0.0, 1.0 - 1.3 * done)
-        temperature = max(0.4, 1.0 - done)
-        figures = self._autoencoder_epoch(noise, temperature, done)
-        return {**figures, "temperature": temperature, **self._view_figures()}
-
-    def _autoencoder_epoch(self, noise: float, temperature: float, done: float) -> dict[str, float]:
+        done = self.epoch / self._rounds(self.stage)
         self._set_learning_rate(done)
-        t = self.training
-        order = torch.randperm(len(t), generator=self.generator)
-        steps = min(MOST_STEPS, max(1, len(t) // self.config.batch_size))
-        totals = {"loss": 0.0, "reconstruction": 0.0, "kl": 0.0, "forward": 0.0, "inverse": 0.0}
+        progress = done if self.stage == "network" else 1.0
+        noise, temperature = self.ingredients.noise(progress), self.ingredients.temperature(progress)
+        order = torch.randperm(len(self.training), generator=self.generator)
+        steps = min(MOST_STEPS, max(1, len(order) // self.config.batch_size))
+        totals: dict[str, float] = {}
         for rows in order[: steps * self.config.batch_size].chunk(steps):
-            parts = self._loss(rows.numpy(), noise, temperature)
-            self.optimizer.zero_grad(set_to_none=True)
-            parts["loss"].backward()
-            self.optimizer.step()
-            for name, value in parts.items():
-                totals[name] += float(value.detach()) / steps
-        return totals
+            self._step(self.autoencoding.loss(rows.numpy(), noise, temperature), totals, steps)
+        codec = SymbolicCodec(self.model)
+        if self.held_out is not None:
+            gates = self.held_out.guided(codec, self.guide)
+        else:
+            gates = view_gates(codec, self.everything.views)
+        return {**totals, "temperature": temperature, **gates}
 
-    def _loss(self, rows: np.ndarray, noise: float, temperature: float) -> dict[str, Tensor]:
-        t, model = self.training, self.model
-        action = torch.as_tensor(t.action[rows], device=self.device)
-        # Source and target views overlap much; each distinct view goes through the encoder once.
-        views, place = np.unique(np.concatenate([t.source[rows], t.target[rows]]), return_inverse=True)
-        source, target = torch.as_tensor(place, device=self.device).chunk(2)
-        batch = self.views[torch.as_tensor(views, device=self.device)]
-        logits = model.encode(batch)
-        sample, soft = losses.sample_straight_through(logits, temperature, noise, self.generator)
-        certain = model.one_hot(logits.argmax(-1))
-        before, then = sample[source], certain[target]
-        parts = {
-            "reconstruction": losses.reconstruction(model.decode(sample), batch, self.weights),
-            "kl": losses.kl_to_uniform(logits),
-            "forward": F.cross_entropy(self.guide(before, action, then).flatten(0, 1), then.argmax(-1).flatten())
-            * model.num_factors,
-            "inverse": F.cross_entropy(model.infer_action(before, sample[target]), action),
-        }
-        # The KL pulls towards the uniform prior; its weight fades with the noise, for codes are to be certain.
-        parts["loss"] = (
-            parts["reconstruction"]
-            + self.config.kl_weight * noise * 0.1 * parts["kl"]
-            + FORWARD_WEIGHT * parts["forward"]
-            + INVERSE_WEIGHT * parts["inverse"]
-            - USAGE_WEIGHT * losses.usage_entropy(soft)
-        )
-        return parts
-
-    # ---------------------------------------------------------------- stages 2 and 3
-    def _questions_round(self) -> dict[str, Any]:
-        assert self.search is not None
-        return self.search.questions_round(self.epoch / (self._rounds("questions") - 1), self.rng)
-
-    def _codes_round(self) -> dict[str, Any]:
-        assert self.search is not None
-        return self.search.codes_round(self.epoch / self._rounds("codes"), self.rng)
-
-    def named_factors(self) -> dict[str, Any]:
-        """The questions of the named factors and what every value answers; see `CodeSearch.meanings`."""
-        return self.search.meanings() if self.search is not None else {}
-
-    # ---------------------------------------------------------------- stage 4
-    def _fit_epoch(self) -> dict[str, Any]:
-        done = self.epoch / self._rounds("fit")
-        if self.search is None or self.search.book is None:
-            return {**self._autoencoder_epoch(0.0, 0.4, done), **self._view_figures()}
+    # ---------------------------------------------------------------- a code book is learned
+    def _fit_epoch(self, done: float) -> dict[str, Any]:
+        assert self.search is not None and self.search.book is not None
         self._set_learning_rate(done)
-        t, model = self.final, self.model
-        codes = torch.as_tensor(self.search.book.codes, device=self.device)
-        size = min(t.num_views, self.config.batch_size)
-        steps = max(8, min(MOST_STEPS, PASSES * t.num_views // size))
-        totals = {"loss": 0.0, "code": 0.0, "reconstruction": 0.0, "inverse": 0.0}
+        t = self.training if self.stage == "fit" else self.everything
+        model, book = self.model, self.search.book
+        codes = torch.as_tensor(book.codes, device=self.device)
+        known = torch.arange(t.num_views) if self.stage == "complete" else torch.as_tensor(np.flatnonzero(t.visits))
+        size = min(len(known), self.config.batch_size)
+        steps = max(FIT_STEPS, min(MOST_STEPS, PASSES * len(known) // size))
+        totals: dict[str, float] = {}
         for _ in range(steps):
-            rows = torch.randperm(t.num_views, generator=self.generator)[:size].to(self.device)
+            rows = known[torch.randperm(len(known), generator=self.generator)[:size]].to(self.device)
             edges = torch.randint(len(t), (size,), generator=self.generator).numpy()
             before, after = (model.one_hot(codes[torch.as_tensor(ends[edges])]) for ends in (t.source, t.target))
             action = torch.as_tensor(t.action[edges], device=self.device)
@@ -264,52 +220,44 @@ class SymbolicTrainer:
                 "inverse": F.cross_entropy(model.infer_action(before, after), action),
             }
             parts["loss"] = parts["code"] + parts["reconstruction"] + parts["inverse"]
-            self.optimizer.zero_grad(set_to_none=True)
-            parts["loss"].backward()
-            self.optimizer.step()
-            for name, value in parts.items():
-                totals[name] += float(value.detach()) / steps
-        figures = self._view_figures()
+            self._step(parts, totals, steps)
+        known = known.to(self.device)
+        codec = SymbolicCodec(self.model)
         with torch.no_grad():
-            agree = float((model.codes(self.views) == codes).all(1).float().mean())
-        settled = done >= 0.5 and agree == 1.0 and figures["views_exact"] == 1.0
-        return {**totals, "code_agreement": agree, **figures, "converged": settled}
+            agree = float((model.codes(self.views[known]) == codes[known]).all(1).float().mean())
+        exact = view_gates(codec, t.views[known.cpu().numpy()])["views_exact"]
+        # What the codes themselves decide cannot change any more: every gate that this stage can meet is met.
+        figures: dict[str, Any] = {**totals, "code_agreement": agree, "settled": agree == exact == 1.0}
+        self._set_forward_model(t, book.structure)
+        codec = SymbolicCodec(self.model)
+        if self.stage == "complete":
+            return {**figures, **evaluate(codec, self.reference, self.everything.views)}
+        if self.held_out is not None:
+            self.held_out_figures = self.held_out.gates(codec)
+        return {**figures, **self.held_out_figures}
 
     # ---------------------------------------------------------------- shared
-    def _view_figures(self) -> dict[str, Any]:
-        # The gates of every epoch: on held-out maps where the stage leaves some out, on all views otherwise.
-        held_out = self.held_out is not None and (self.stage == "network" or not self.refines)
-        target = self.held_out if held_out and self.held_out is not None else self.final
-        figures = view_gates(SymbolicCodec(self.model), target.views)
-        self.model.train()
-        return figures
+    def named_factors(self) -> dict[str, Any]:
+        """The questions of the named factors and what every value answers; see `CodeSearch.meanings`."""
+        return self.search.meanings() if self.search is not None else {}
 
-    def _measure_held_out(self) -> None:
-        if self.held_out is None:
-            return
-        self._set_forward_model(self.training)
-        codec = SymbolicCodec(self.model)
-        new = ~np.isin(view_keys(self.held_out.views), view_keys(self.training.views[self.training.visits > 0]))
-        self.held_out_figures = {**view_gates(codec, self.held_out.views), **next_gates(codec, self.held_out)}
-        self.held_out_figures |= {"limits": limits(self.held_out), "new_views": int(new.sum())}
-        if new.any():
-            figures = view_gates(codec, self.held_out.views[new])
-            self.held_out_figures |= {f"new_{name}": figures[name] for name in ("views_exact", "cells")}
-        self.model.train()
+    def _step(self, parts: dict[str, Tensor], totals: dict[str, float], steps: int) -> None:
+        self.optimizer.zero_grad(set_to_none=True)
+        parts["loss"].backward()
+        self.optimizer.step()
+        for name, value in parts.items():
+            totals[name] = totals.get(name, 0.0) + float(value.detach()) / steps
 
-    def _set_forward_model(self, transitions: Transitions) -> None:
-        t = transitions
-        refiner = self.refiner if t is self.final else self.train_refiner
+    def _refiner(self, transitions: Transitions) -> Refiner:
+        return Refiner(transitions, self.model.num_values, self.model.num_actions, self.bounds)
+
+    def _set_forward_model(self, t: Transitions, structure: Structure | None = None) -> None:
+        """Tables of `t` in the encoder's own codes; without a structure one is searched."""
         with torch.no_grad():
             codes = self.model.codes(self.views).cpu().numpy().astype(np.int64)
-        found = self.search.book if self.search is not None else None
-        start = found.structure if found is not None else None
-        book = refiner.search(codes, start)
-        self.model.set_transitions(book.structure, codes[t.source], t.action, codes[t.target], t.weight)
-
-    def _logits(self) -> np.ndarray:
-        with torch.no_grad():
-            return np.asarray(self.model.encode(self.views).cpu().numpy(), dtype=np.float64)
+        if structure is None:
+            structure = self._refiner(t).search(codes).structure
+        self.model.set_transitions(structure, codes[t.source], t.action, codes[t.target], t.weight)
 
     def _optimizer(self, rate: float) -> torch.optim.Adam:
         modules = [*self.model.parameters(), *self.guide.parameters()]

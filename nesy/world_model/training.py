@@ -27,7 +27,7 @@ from nesy.world_model.codec import SymbolicCodec
 from nesy.world_model.columns import Columns
 from nesy.world_model.distinct import Transitions, reference_transitions, with_mirror
 from nesy.world_model.gates import evaluate
-from nesy.world_model.guided_gates import guided_gates
+from nesy.world_model.held_out import HeldOut
 from nesy.world_model.imagination import imagined_rollouts
 from nesy.world_model.logs import MetricsLog
 from nesy.world_model.paper_training import PaperTrainer
@@ -67,8 +67,9 @@ def train(
     Returns:
         The gates with the limits of the data beside them (see `gates.evaluate`): views of all kinds, transitions
         of the crossing task; `following`, the same for the transitions of the following task; `held_out`, figures
-        from before any held-out map was learned from; `rollouts`, the likeliest view after 1 to 8
-        imagined steps; `readability` (details in readability.json); `epochs`, `seconds`, `architecture`.
+        from before anything on held-out maps was learned from (of the final codes); `rollouts`, the likeliest view
+        after 1 to 8 imagined steps; `readability` (details in readability.json); `epochs`, `seconds`,
+        `architecture`.
 
     Raises:
         UserError: impossible settings, or no experience.
@@ -103,18 +104,20 @@ def _train(
     if config.mirror_images:
         everything = with_mirror(everything)
     apart = columns.held_out(config.held_out, np.random.default_rng(seed))
-    held_out = columns.transitions(apart) if apart.any() else None
+    reference = references.get("crossing", everything)
     trainer: Trainer
     if config.architecture == "paper":
-        trainer = PaperTrainer(config, seed, everything, columns, apart, held_out)
+        held_out = columns.transitions(apart) if apart.any() else None
+        trainer = PaperTrainer(config, seed, everything, columns, apart, held_out, reference)
     else:
         training = everything
-        if held_out is not None:
+        if apart.any():
             training = columns.transitions(~apart, views=everything.views)
             if config.mirror_images:
                 training = with_mirror(training, views=everything.views)
+        kept = HeldOut(columns, apart, training, seed) if apart.any() else None
         predicates = domain.predicates if domain is not None else None
-        trainer = SymbolicTrainer(config, seed, everything, training, held_out, predicates)
+        trainer = SymbolicTrainer(config, seed, everything, training, kept, predicates, reference)
     fingerprint = _fingerprint(config, seed, everything)
     tick, elapsed = _resume(trainer, folder / CHECKPOINT, fingerprint)
     with MetricsLog(folder, keep=tick) as log, progress.task("training the world model", trainer.length()) as bar:
@@ -122,11 +125,6 @@ def _train(
         started = time.monotonic() - elapsed
         while not trainer.finished:
             figures = trainer.tick(time.monotonic() - started)
-            if isinstance(trainer, SymbolicTrainer) and figures["stage"] == "network" and held_out is not None:
-                rng = np.random.default_rng(seed)
-                now = SymbolicCodec(trainer.model)
-                figures |= guided_gates(now, trainer.guide, held_out, columns, apart, rng)
-                trainer.model.train()
             tick += 1
             elapsed = time.monotonic() - started
             log.write(tick, {**figures, "seconds": round(elapsed, 3)})
@@ -137,7 +135,7 @@ def _train(
             bar.advance(1, **shown)
     codec = SymbolicCodec(trainer.model)
     metrics: dict[str, Any] = {
-        **evaluate(codec, references.get("crossing", everything), everything.views),
+        **evaluate(codec, reference, everything.views),
         **({"following": evaluate(codec, references["following"])} if references else {}),
         "held_out": trainer.held_out_figures,
         "rollouts": imagined_rollouts(codec, columns, np.random.default_rng(seed)),

@@ -44,7 +44,7 @@ def test_named_factors_answer_their_questions_and_codes_are_distinct(refiner: Re
     for _ in range(2):
         rng = np.random.default_rng(3)
         search = CodeSearch(refiner, questions, 8, 5, wanted)
-        search.start(rng.normal(size=(refiner.transitions.num_views, 8, 8)), rng)
+        search.start(rng)
         found.append(search.search(3, 5, rng))
     np.testing.assert_array_equal(found[0].codes, found[1].codes)
     codes = found[0].codes
@@ -61,7 +61,7 @@ def test_named_factors_answer_their_questions_and_codes_are_distinct(refiner: Re
 def test_annealing_ends_where_counting_anew_ends(refiner: Refiner) -> None:
     questions = Questions.about_cells(refiner.transitions.views)
     rng = np.random.default_rng(0)
-    groups = GroupSearch(questions, refiner, {})
+    groups = GroupSearch(questions, refiner, {}, 0.005)
     asked, book = groups.start(8, rng)
     best = np.inf
     for temperature in (0.1, 0.01, 0.0):
