@@ -1,4 +1,11 @@
-"""Variable elimination planned once per model: which sums, in which order, over which flat arrays.
+"""Exact one-step marginals planned once per model: which sums, in which order, over which flat arrays.
+
+    P(S') for sets S' of next factors and of the present ones that they share, by forward recursion: with X the last
+    factor of S' in `order`,
+        P(S' + X) = sum over parents(X) not in S' of  P(S' + parents(X)) P(X | parents(X))
+    where present factors that no other factor in question depends on come in as their belief, and are summed out of
+    X's table beforehand where that is less work. Factors that nothing in question depends on never appear. Sets
+    asked for several times are computed once, smaller ones from larger ones.
 
 The plan is plain integers, run for every belief by one compiled kernel (nesy.dbn.factored).
 """
@@ -17,186 +24,222 @@ from nesy.errors import UserError
 MAX_WORKSPACE = 1 << 24
 
 
-@dataclass(frozen=True)
-class _Tensor:
-    """A table in one of the kernel's two memories."""
-
-    scope: tuple[int, ...]
-    shared: bool
-    """In the model's tables rather than in the memory of one belief."""
-    offset: int
-    strides: tuple[int, ...]
-
-
 class Programs(NamedTuple):
     """The planned sums of all actions; a named tuple, so numba takes it as an argument.
 
-    An operation sums a product of tables over some variables: `acc[k] += prod_j table_j[..., k]`. Its variables
-    are ordered: those of the result first (`num_outer`), then those summed out; `k` is the inner variable.
+    An operation is `out[outer, k] = sum over summed of joint[...] prod belief[...] table[..., k]`. Variables v < N are
+    factors of slice t, v >= N factor v - N of slice t+1; `memory` of one belief holds first the belief [N, K], then
+    the result [N, K], then K ones, then intermediate tables.
     """
 
     first: np.ndarray
     """int64 [A + 1]: first operation of each action."""
+    target: np.ndarray
+    """int64 [O]: the factor of slice t+1 that `k` is about."""
     num_outer: np.ndarray
     """int64 [O]."""
     num_loops: np.ndarray
     """int64 [O]: outer and summed variables."""
     variables: np.ndarray
-    """int64 [O, V]."""
-    num_inputs: np.ndarray
-    """int64 [O]."""
+    """int64 [O, V]: outer ones first."""
     shared: np.ndarray
-    """bool [O, I]."""
-    base: np.ndarray
-    """int64 [O, I]."""
-    strides: np.ndarray
-    """int64 [O, I, V]."""
-    inner: np.ndarray
-    """int64 [O, I]: stride of the inner variable; 0 where the table does not have it."""
-    out_base: np.ndarray
+    """bool [O]: the table is one of the model's rather than an intermediate one."""
+    table: np.ndarray
+    """int64 [O]: where it starts."""
+    table_strides: np.ndarray
+    """int64 [O, V]."""
+    joint: np.ndarray
+    """int64 [O]: where the joint distribution starts; the ones where there is none."""
+    joint_strides: np.ndarray
+    """int64 [O, V]."""
+    out: np.ndarray
     """int64 [O]."""
     out_strides: np.ndarray
     """int64 [O, V]."""
+    beliefs: np.ndarray
+    """int64 [O, V]: where the weights of a variable's values stand; the ones where it has none."""
     mixes: np.ndarray
-    """bool [O]: the operation mixes rows of one table, weighted by a belief for each parent: the usual case."""
+    """bool [O]: the rows of one of the model's tables, mixed by the beliefs of its parents in slice t."""
     memory: int
-    """Entries of one belief's memory: belief [N, K], result [N, K], intermediate tables."""
+    """Entries of one belief's memory."""
+
+
+@dataclass(frozen=True)
+class _Tensor:
+    """A table in the model's memory (`shared`) or in that of one belief; its last axis has stride 1."""
+
+    scope: tuple[int, ...]
+    shared: bool
+    offset: int
+    num_values: int
+
+    def stride(self, variable: int) -> int:
+        """0 where the table does not have the variable."""
+        if variable not in self.scope:
+            return 0
+        return int(self.num_values ** (len(self.scope) - 1 - self.scope.index(variable)))
+
+
+@dataclass(frozen=True)
+class _Operation:
+    outer: tuple[int, ...]
+    summed: tuple[int, ...]
+    weighted: frozenset[int]
+    table: _Tensor
+    joint: _Tensor | None
+    out: _Tensor
+
+
+@dataclass(frozen=True)
+class _Step:
+    """How one set is computed: from a larger one with the same last factor, or from the last factor's table."""
+
+    larger: frozenset[int] | None
+    joint: frozenset[int] | None = None
+    private: frozenset[int] = frozenset()
 
 
 class _Planner:
-    """Plans the sums of one model."""
+    """Plans the sums of one action."""
 
-    def __init__(self, dbn: TwoSliceDBN, frontier: bool) -> None:
-        self.dbn, self.frontier = dbn, frontier
-        self.operations: list[tuple[tuple[int, ...], tuple[int, ...], list[_Tensor], _Tensor]] = []
-        self.memory = 2 * dbn.num_factors * dbn.num_values
+    def __init__(self, dbn: TwoSliceDBN, action: int, memory: int) -> None:
+        self.dbn, self.action, self.memory = dbn, action, memory
+        self.n, self.k = dbn.num_factors, dbn.num_values
+        self.rank = {self.n + i: place for place, i in enumerate(dbn.order)}
+        self.operations: list[_Operation] = []
+        self._made: dict[frozenset[int], _Tensor] = {}
+        self._reduced: dict[tuple[int, frozenset[int]], _Tensor] = {}
 
-    def plan(self, action: int, factor: int) -> None:
-        """Marginal of one next factor under one action."""
-        dbn, n, k = self.dbn, self.dbn.num_factors, self.dbn.num_values
-        pool: list[_Tensor] = []
-        now: set[int] = set()
-        for i in (factor,) if self.frontier else ancestors(dbn, action, (factor,)):
-            axes = tuple(where * n + p for where, p in dbn.parents(action, i)) + (n + i,)
-            strides = tuple(k ** (len(axes) - 1 - axis) for axis in range(len(axes)))
-            pool.append(_Tensor(axes, True, int(dbn.offsets[action, i]) * k, strides))
-            now |= set(dbn.parents_now[action][i])
-            if self.frontier:  # parents of slice t+1 have their marginals by now, and are taken as free of each other
-                now |= {n + p for p in dbn.parents_next[action][i]}
-        pool += [_Tensor((p,), False, p * k, (1,)) for p in sorted(now)]
-        target = n + factor
-        out = _Tensor((target,), False, target * k, (1,))
-        if len(pool) == 1 + len(now):
-            # one table and a belief for each of its parents: its rows are mixed in one go
-            self.operations.append(((target,), tuple(sorted(now)), pool, out))
-            return
-        waiting = {v for tensor in pool for v in tensor.scope} - {target}
-        while waiting:
-            variable = min(waiting, key=lambda v: (len(_scope(pool, v)), v))
-            chosen = [tensor for tensor in pool if variable in tensor.scope]
-            pool = [tensor for tensor in pool if variable not in tensor.scope]
-            elsewhere = {v for tensor in pool for v in tensor.scope} | {target}
-            scope = {v for tensor in chosen for v in tensor.scope}
-            # whatever occurs nowhere else is summed out in the same loop
-            result = tuple(sorted(scope & elsewhere))
-            summed = tuple(sorted(scope - set(result)))
-            waiting -= set(summed)
-            if not pool and not waiting:
-                self.operations.append((result, summed, chosen, out))
-                return
-            pool.append(self._sum(chosen, result, summed))
-        self.operations.append(((target,), (), pool, out))
+    def plan(self) -> None:
+        """Plan the marginals of all factors; the operations stand in `operations`."""
+        wanted: dict[int, set[frozenset[int]]] = {self.n + i: {frozenset([self.n + i])} for i in range(self.n)}
+        steps: dict[frozenset[int], _Step] = {}
+        chosen: list[list[frozenset[int]]] = []
+        # what a later factor needs of earlier ones is known once the later one has been looked at
+        for i in reversed(self.dbn.order):
+            asked = sorted(wanted[self.n + i], key=lambda s: (-len(s), sorted(s)))
+            for place, scope in enumerate(asked):
+                step = self._step(self.n + i, scope, asked[:place])
+                steps[scope] = step
+                if step.joint is not None:
+                    wanted[self._last(step.joint)].add(step.joint)
+            chosen.append(asked)
+        for asked in reversed(chosen):
+            for scope in asked:
+                self._emit(scope, steps[scope])
 
-    def _sum(self, chosen: list[_Tensor], result: tuple[int, ...], summed: tuple[int, ...]) -> _Tensor:
-        k = self.dbn.num_values
-        strides = tuple(k ** (len(result) - 1 - axis) for axis in range(len(result)))
-        out = _Tensor(result, False, self.memory, strides)
-        self.memory += k ** len(result)
+    def _last(self, scope: frozenset[int]) -> int:
+        return max((v for v in scope if v >= self.n), key=self.rank.__getitem__)
+
+    def _step(self, x: int, scope: frozenset[int], larger: list[frozenset[int]]) -> _Step:
+        """The cheaper way to one set; `larger` ones with the same last factor come before it."""
+        parents = {where * self.n + p for where, p in self.dbn.parents(self.action, x - self.n)}
+        needed = (scope - {x}) | parents
+        joint = {v for v in needed if v >= self.n}
+        if joint:
+            below = ancestors(self.dbn, self.action, tuple(v - self.n for v in joint))
+            joint |= needed & {p for i in below for p in self.dbn.parents_now[self.action][i]}
+        private = parents - joint - scope
+        within = len(needed) + 1
+        if private and needed - parents:
+            within = max(len(parents), len(needed - private)) + 1
+        else:
+            private = set()
+        fitting = [s for s in larger if s > scope]
+        nearest = min(fitting, key=len, default=None)
+        if nearest is not None and len(nearest) < within:
+            return _Step(nearest)
+        return _Step(None, frozenset(joint) if joint else None, frozenset(private))
+
+    def _emit(self, scope: frozenset[int], step: _Step) -> None:
+        x = self._last(scope)
+        kept = tuple(sorted(scope - {x}))
+        if step.larger is not None:
+            table, joint = self._made[step.larger], None
+            summed, weighted = step.larger - scope, frozenset[int]()
+        else:
+            table = self._table(x, step.private)
+            joint = None if step.joint is None else self._made[step.joint]
+            parents = set(table.scope) - {x}
+            summed = (frozenset(parents) | (step.joint or frozenset())) - scope
+            weighted = (frozenset(parents) | frozenset(kept)) - (step.joint or frozenset())
+        out = _Tensor((x,), False, x * self.k, self.k) if not kept else self._new((*kept, x))
+        self._made[scope] = out
+        self.operations.append(_Operation(kept, self._in_order(table, summed), weighted, table, joint, out))
+
+    def _table(self, x: int, private: frozenset[int]) -> _Tensor:
+        """The conditional table of a factor, with its private parents summed out."""
+        axes = tuple(where * self.n + p for where, p in self.dbn.parents(self.action, x - self.n))
+        whole = _Tensor((*axes, x), True, int(self.dbn.offsets[self.action, x - self.n]) * self.k, self.k)
+        if not private:
+            return whole
+        key = (x, private)
+        if key not in self._reduced:
+            kept = tuple(v for v in axes if v not in private)
+            out = self._new((*kept, x))
+            self.operations.append(_Operation(kept, self._in_order(whole, private), private, whole, None, out))
+            self._reduced[key] = out
+        return self._reduced[key]
+
+    def _new(self, scope: tuple[int, ...]) -> _Tensor:
+        out = _Tensor(scope, False, self.memory, self.k)
+        self.memory += self.k ** len(scope)
         if self.memory > MAX_WORKSPACE:
             raise UserError("this model is too densely connected for exact marginals; sample instead")
-        self.operations.append((result, summed, chosen, out))
         return out
 
+    @staticmethod
+    def _in_order(table: _Tensor, variables: frozenset[int]) -> tuple[int, ...]:
+        """Summed variables: those of the table last and in its order, so that neighbours are read one after another."""
+        return tuple(sorted(variables - set(table.scope))) + tuple(v for v in table.scope if v in variables)
 
-def _scope(pool: list[_Tensor], variable: int) -> set[int]:
-    return {v for tensor in pool if variable in tensor.scope for v in tensor.scope}
 
-
-def plan_updates(dbn: TwoSliceDBN, frontier: bool = False) -> Programs:
+def plan_updates(dbn: TwoSliceDBN) -> Programs:
     """Plan the marginals of every factor under every action.
-
-    Args:
-        dbn: the model.
-        frontier: take a factor's parents of slice t+1 as independent of all its other parents.
 
     Raises:
         UserError: the model is too densely connected.
     """
-    planner = _Planner(dbn, frontier)
-    first = [0]
-    for a in range(dbn.num_actions):
-        for i in dbn.order:
-            planner.plan(a, i)
-        first.append(len(planner.operations))
-    operations = planner.operations
-    mixes = [_mixes(result, tensors) for result, _, tensors, _ in operations]
-    loops = [
-        # rows are mixed in the order of the table, so that their weights are a Kronecker product
-        _loops(result, tensors[0].scope[:-1] if mixed else summed, dbn.num_factors)
-        for (result, summed, tensors, _), mixed in zip(operations, mixes, strict=True)
-    ]
-    inputs = max(len(tensors) for _, _, tensors, _ in operations)
-    width = max(1, max(len(outer) + len(summed) for outer, summed, _ in loops))
+    n, k = dbn.num_factors, dbn.num_values
+    ones = 2 * n * k
+    first, operations, memory = [0], list[_Operation](), ones + k
+    for action in range(dbn.num_actions):
+        planner = _Planner(dbn, action, ones + k)
+        planner.plan()
+        operations += planner.operations
+        first.append(len(operations))
+        memory = max(memory, planner.memory)
     number = len(operations)
+    width = max(1, max(len(o.outer) + len(o.summed) for o in operations))
+
+    def filled(value: int = 0) -> np.ndarray:
+        return np.full((number, width), value, dtype=np.int64)
+
     programs = Programs(
         first=np.array(first, dtype=np.int64),
-        num_outer=np.array([len(outer) for outer, _, _ in loops], dtype=np.int64),
-        num_loops=np.array([len(outer) + len(summed) for outer, summed, _ in loops], dtype=np.int64),
-        variables=np.zeros((number, width), dtype=np.int64),
-        num_inputs=np.array([len(tensors) for _, _, tensors, _ in operations], dtype=np.int64),
-        shared=np.zeros((number, inputs), dtype=np.bool_),
-        base=np.zeros((number, inputs), dtype=np.int64),
-        strides=np.zeros((number, inputs, width), dtype=np.int64),
-        inner=np.zeros((number, inputs), dtype=np.int64),
-        out_base=np.array([out.offset for _, _, _, out in operations], dtype=np.int64),
-        out_strides=np.zeros((number, width), dtype=np.int64),
-        mixes=np.array(mixes),
-        memory=planner.memory,
+        target=np.array([o.out.scope[-1] - n for o in operations], dtype=np.int64),
+        num_outer=np.array([len(o.outer) for o in operations], dtype=np.int64),
+        num_loops=np.array([len(o.outer) + len(o.summed) for o in operations], dtype=np.int64),
+        variables=filled(),
+        shared=np.array([o.table.shared for o in operations]),
+        table=np.array([o.table.offset for o in operations], dtype=np.int64),
+        table_strides=filled(),
+        joint=np.array([ones if o.joint is None else o.joint.offset for o in operations], dtype=np.int64),
+        joint_strides=filled(),
+        out=np.array([o.out.offset for o in operations], dtype=np.int64),
+        out_strides=filled(),
+        beliefs=filled(ones),
+        mixes=np.array(
+            [o.table.shared and o.joint is None and o.out.offset == o.out.scope[-1] * k for o in operations]
+        ),
+        memory=memory,
     )
-    for o, ((_, _, tensors, out), (outer, summed, inner)) in enumerate(zip(operations, loops, strict=True)):
-        variables = outer + summed
-        programs.variables[o, : len(variables)] = variables
-        programs.out_strides[o, : len(outer)] = [_stride(out, v) for v in outer]
-        for j, tensor in enumerate(tensors):
-            programs.shared[o, j] = tensor.shared
-            programs.base[o, j] = tensor.offset
-            programs.strides[o, j, : len(variables)] = [_stride(tensor, v) for v in variables]
-            programs.inner[o, j] = _stride(tensor, inner)
+    for row, o in enumerate(operations):
+        for place, v in enumerate((*o.outer, *o.summed)):
+            programs.variables[row, place] = v
+            programs.table_strides[row, place] = o.table.stride(v)
+            programs.joint_strides[row, place] = 0 if o.joint is None else o.joint.stride(v)
+            programs.out_strides[row, place] = o.out.stride(v) if place < len(o.outer) else 0
+            if v in o.weighted:
+                programs.beliefs[row, place] = v * k
     return programs
-
-
-def _loops(
-    result: tuple[int, ...], summed: tuple[int, ...], num_factors: int
-) -> tuple[tuple[int, ...], tuple[int, ...], int]:
-    """Outer, summed and inner variables: the inner one is the result's last factor of slice t+1.
-
-    Every result has one: an elimination that left none would have to be cut off from the target.
-    """
-    inner = max(v for v in result if v >= num_factors)
-    return tuple(v for v in result if v != inner), summed, inner
-
-
-def _mixes(result: tuple[int, ...], tensors: list[_Tensor]) -> bool:
-    table, beliefs = tensors[0], tensors[1:]
-    weighted = [tensor.scope for tensor in beliefs]
-    return (
-        len(result) == 1
-        and table.shared
-        and not any(tensor.shared for tensor in beliefs)
-        and sorted(weighted) == sorted((v,) for v in table.scope[:-1])
-        and all(tensor.offset == v * table.strides[-2] for tensor in beliefs for v in tensor.scope)
-    )
-
-
-def _stride(tensor: _Tensor, variable: int) -> int:
-    return tensor.strides[tensor.scope.index(variable)] if variable in tensor.scope else 0

@@ -1,6 +1,6 @@
 """Compiled, batched belief updates: exact one-step marginals for many beliefs at once.
 
-Sums run over the support of the factors now, so certain beliefs cost next to nothing.
+Sums run over the support of the factors now and next, so certain beliefs cost next to nothing.
 """
 
 from __future__ import annotations
@@ -13,222 +13,240 @@ from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
 
 MOST_WEIGHTS = 4096
+BLOCK = 32
+"""Beliefs that are spread over many values are mixed so many at a time: one matrix product."""
 
 
 @njit(cache=True)
-def _sum_products(
+def _sum(
     programs: Programs,
     o: int,
-    tables: np.ndarray,
+    source: np.ndarray,
     memory: np.ndarray,
     support: np.ndarray,
     sizes: np.ndarray,
+    loops: np.ndarray,
     digits: np.ndarray,
-    offsets: np.ndarray,
-    accumulator: np.ndarray,
-    product: np.ndarray,
-) -> None:
-    """One operation: for every combination of the outer variables, the sum over the summed ones."""
-    num_values = accumulator.shape[0]
-    outer, loops, inputs = programs.num_outer[o], programs.num_loops[o], programs.num_inputs[o]
-    digits[:loops] = 0
-    while True:
-        target = programs.out_base[o]
-        for position in range(outer):
-            value = support[programs.variables[o, position], digits[position]]
-            target += programs.out_strides[o, position] * value
-        for j in range(inputs):
-            offsets[j] = programs.base[o, j]
-            for position in range(loops):
-                value = support[programs.variables[o, position], digits[position]]
-                offsets[j] += programs.strides[o, j, position] * value
-        accumulator[:] = 0.0
-        while True:
-            weight = 1.0
-            for j in range(inputs):
-                if programs.inner[o, j] == 0:
-                    weight *= tables[offsets[j]] if programs.shared[o, j] else memory[offsets[j]]
-            if weight != 0.0:
-                product[:] = weight
-                for j in range(inputs):
-                    stride, start = programs.inner[o, j], offsets[j]
-                    if stride != 0:
-                        source = tables if programs.shared[o, j] else memory
-                        for k in range(num_values):
-                            product[k] *= source[start + k * stride]
-                for k in range(num_values):
-                    accumulator[k] += product[k]
-            position = loops - 1
-            while position >= outer:
-                variable = programs.variables[o, position]
-                before = support[variable, digits[position]]
-                digits[position] = digits[position] + 1 if digits[position] + 1 < sizes[variable] else 0
-                step = support[variable, digits[position]] - before
-                for j in range(inputs):
-                    offsets[j] += programs.strides[o, j, position] * step
-                if digits[position] != 0:
-                    break
-                position -= 1
-            if position < outer:
-                break
-        for k in range(num_values):
-            memory[target + k] = accumulator[k]
-        position = outer - 1
-        while position >= 0:
-            variable = programs.variables[o, position]
-            digits[position] = digits[position] + 1 if digits[position] + 1 < sizes[variable] else 0
-            if digits[position] != 0:
-                break
-            position -= 1
-        if position < 0:
-            return
-
-
-@njit(cache=True)
-def _mix_rows(
-    programs: Programs,
-    o: int,
-    tables: np.ndarray,
-    memory: np.ndarray,
-    support: np.ndarray,
-    sizes: np.ndarray,
-    digits: np.ndarray,
-    starts: np.ndarray,
+    places: np.ndarray,
     weights: np.ndarray,
-    kronecker: np.ndarray,
-    accumulator: np.ndarray,
+    num_values: int,
 ) -> None:
-    """One operation of the usual kind; weights and row starts are kept per depth, only the last parent's change."""
-    num_values = accumulator.shape[0]
-    loops = programs.num_loops[o]
-    total, inside = 1, 1
-    for position in range(loops):
-        total *= num_values
-        inside *= sizes[programs.variables[o, position]]
-    if total <= kronecker.shape[0] and 4 * inside >= total:
-        # most rows have some weight: one matrix product
-        kronecker[0] = 1.0
-        count = 1
-        for position in range(loops):
-            start = programs.variables[o, position] * num_values
-            for row in range(count - 1, -1, -1):
-                scale = kronecker[row]
-                for value in range(num_values):
-                    kronecker[row * num_values + value] = scale * memory[start + value]
-            count *= num_values
-        first = programs.base[o, 0]
-        block = tables[first : first + total * num_values].reshape(total, num_values)
-        np.dot(kronecker[:total], block, accumulator)
-        memory[programs.out_base[o] : programs.out_base[o] + num_values] = accumulator
-        return
-    accumulator[:] = 0.0
-    starts[0], weights[0] = programs.base[o, 0], 1.0
-    depth = 0
-    if loops > 0:
-        digits[0] = -1
-    else:
-        for k in range(num_values):
-            accumulator[k] = tables[starts[0] + k]
-    while depth >= 0 and loops > 0:
-        variable = programs.variables[o, depth]
-        stride = programs.strides[o, 0, depth]
-        if depth == loops - 1:
-            # four values at a time in registers: several times faster than adding rows in memory
-            belief, start, scale = variable * num_values, starts[depth], weights[depth]
-            k = 0
-            while k + 4 <= num_values:
-                a, b, c, d = accumulator[k], accumulator[k + 1], accumulator[k + 2], accumulator[k + 3]
-                for digit in range(sizes[variable]):
-                    value = support[variable, digit]
-                    weight = scale * memory[belief + value]
-                    row = start + stride * value + k
-                    a += weight * tables[row]
-                    b += weight * tables[row + 1]
-                    c += weight * tables[row + 2]
-                    d += weight * tables[row + 3]
-                accumulator[k], accumulator[k + 1], accumulator[k + 2], accumulator[k + 3] = a, b, c, d
-                k += 4
-            while k < num_values:
-                for digit in range(sizes[variable]):
-                    value = support[variable, digit]
-                    accumulator[k] += scale * memory[belief + value] * tables[start + stride * value + k]
-                k += 1
-            depth -= 1
+    """One operation; `places` holds per depth where table, joint and out stand, `weights` the product so far."""
+    row, joint, out, scale = programs.table[o], programs.joint[o], programs.out[o], 1.0
+    depths, outer = 0, 0
+    for place in range(programs.num_loops[o]):
+        variable = programs.variables[o, place]
+        if sizes[variable] == 1:
+            # no loop: its only value counts once and for all
+            value = support[variable, 0]
+            row += programs.table_strides[o, place] * value
+            joint += programs.joint_strides[o, place] * value
+            out += programs.out_strides[o, place] * value
+            scale *= memory[programs.beliefs[o, place] + value]
         else:
+            loops[depths] = place
+            depths += 1
+            outer += place < programs.num_outer[o]
+    if depths == 0:
+        scale *= memory[joint]
+        for k in range(num_values):
+            memory[out + k] = scale * source[row + k]
+        return
+    places[0, 0], places[0, 1], places[0, 2], weights[0], digits[0] = row, joint, out, scale, -1
+    depth = 0
+    while depth >= 0:
+        place = loops[depth]
+        variable, belief = programs.variables[o, place], programs.beliefs[o, place]
+        step, joint_step = programs.table_strides[o, place], programs.joint_strides[o, place]
+        row, joint, out, scale = places[depth, 0], places[depth, 1], places[depth, 2], weights[depth]
+        if depth == outer and digits[depth] == -1:
+            for k in range(num_values):
+                memory[out + k] = 0.0
+        if depth < depths - 1:
             digits[depth] += 1
             if digits[depth] == sizes[variable]:
                 depth -= 1
-            else:
-                value = support[variable, digits[depth]]
-                weights[depth + 1] = weights[depth] * memory[variable * num_values + value]
-                starts[depth + 1] = starts[depth] + stride * value
-                depth += 1
-                digits[depth] = -1
-    for k in range(num_values):
-        memory[programs.out_base[o] + k] = accumulator[k]
+                continue
+            value = support[variable, digits[depth]]
+            depth += 1
+            places[depth, 0], places[depth, 1] = row + step * value, joint + joint_step * value
+            places[depth, 2] = out + programs.out_strides[o, place] * value
+            weights[depth] = scale * memory[belief + value]
+            digits[depth] = -1
+            continue
+        if depth < outer:
+            out_step = programs.out_strides[o, place]
+            for digit in range(sizes[variable]):
+                value = support[variable, digit]
+                weight = scale * memory[belief + value] * memory[joint + joint_step * value]
+                here, there = row + step * value, out + out_step * value
+                for k in range(num_values):
+                    memory[there + k] = weight * source[here + k]
+        else:
+            # four values at a time in registers: several times faster than adding rows in memory
+            k = 0
+            while k + 4 <= num_values:
+                a, b, c, d = memory[out + k], memory[out + k + 1], memory[out + k + 2], memory[out + k + 3]
+                for digit in range(sizes[variable]):
+                    value = support[variable, digit]
+                    weight = scale * memory[belief + value] * memory[joint + joint_step * value]
+                    here = row + step * value + k
+                    a += weight * source[here]
+                    b += weight * source[here + 1]
+                    c += weight * source[here + 2]
+                    d += weight * source[here + 3]
+                memory[out + k], memory[out + k + 1], memory[out + k + 2], memory[out + k + 3] = a, b, c, d
+                k += 4
+            while k < num_values:
+                total = memory[out + k]
+                for digit in range(sizes[variable]):
+                    value = support[variable, digit]
+                    weight = scale * memory[belief + value] * memory[joint + joint_step * value]
+                    total += weight * source[row + step * value + k]
+                memory[out + k] = total
+                k += 1
+        depth -= 1
 
 
 @njit(cache=True)
-def _run(programs: Programs, tables: np.ndarray, beliefs: np.ndarray, actions: np.ndarray) -> np.ndarray:
+def _mix(
+    programs: Programs,
+    o: int,
+    tables: np.ndarray,
+    beliefs: np.ndarray,
+    chosen: np.ndarray,
+    kronecker: np.ndarray,
+    mixed: np.ndarray,
+) -> None:
+    """One operation that mixes rows, for a block of beliefs: their weights are Kronecker products."""
+    num_values, loops = beliefs.shape[2], programs.num_loops[o]
+    last = programs.variables[o, loops - 1]
+    count = num_values ** (loops - 1)
+    weights = kronecker[: len(chosen) * count].reshape(len(chosen), count)
+    for b in range(len(chosen)):
+        weights[b, 0] = 1.0
+        filled = 1
+        for place in range(loops - 1):
+            factor = programs.variables[o, place]
+            for row in range(filled - 1, -1, -1):
+                scale = weights[b, row]
+                for value in range(num_values):
+                    weights[b, row * num_values + value] = scale * beliefs[chosen[b], factor, value]
+            filled *= num_values
+    # one matrix product for all parents but the last, whose values lie side by side with those of the factor
+    start, width = programs.table[o], num_values * num_values
+    product = np.dot(weights, tables[start : start + count * width].reshape(count, width))
+    for b in range(len(chosen)):
+        for k in range(num_values):
+            total = 0.0
+            for value in range(num_values):
+                total += beliefs[chosen[b], last, value] * product[b, value * num_values + k]
+            mixed[b, programs.target[o], k] = total
+
+
+@njit(cache=True)
+def _is_dense(programs: Programs, o: int, counts: np.ndarray, chosen: np.ndarray, num_values: int) -> bool:
+    """Whether most rows that the operation mixes have some weight in most of the beliefs."""
+    rows, held = float(num_values) ** programs.num_loops[o], 0.0
+    if rows > MOST_WEIGHTS * num_values or rows < num_values:
+        return False
+    for b in range(len(chosen)):
+        inside = 1.0
+        for place in range(programs.num_loops[o]):
+            inside *= counts[chosen[b], programs.variables[o, place]]
+        held += inside
+    return 12.0 * held >= rows * len(chosen)
+
+
+@njit(cache=True)
+def _run(
+    programs: Programs, tables: np.ndarray, beliefs: np.ndarray, actions: np.ndarray, order: np.ndarray
+) -> np.ndarray:
     number, n, num_values = beliefs.shape
     result = np.empty((number, n, num_values))
     memory = np.empty(programs.memory)
+    memory[2 * n * num_values : (2 * n + 1) * num_values] = 1.0
     support = np.empty((2 * n, num_values), dtype=np.int64)
-    sizes = np.full(2 * n, num_values, dtype=np.int64)
-    for v in range(n, 2 * n):
-        for k in range(num_values):
-            support[v, k] = k
-    digits = np.zeros(programs.variables.shape[1], dtype=np.int64)
-    offsets = np.zeros(programs.base.shape[1], dtype=np.int64)
-    starts = np.zeros(programs.variables.shape[1] + 1, dtype=np.int64)
-    weights = np.zeros(programs.variables.shape[1] + 1)
-    kronecker = np.empty(MOST_WEIGHTS)
-    accumulator, product = np.empty(num_values), np.empty(num_values)
+    sizes = np.zeros(2 * n, dtype=np.int64)
+    width = programs.variables.shape[1]
+    loops, digits = np.zeros(width + 1, dtype=np.int64), np.zeros(width + 1, dtype=np.int64)
+    weights = np.zeros(width + 1)
+    places = np.zeros((width + 1, 3), dtype=np.int64)
+    counts = np.zeros((number, n), dtype=np.int64)
     for b in range(number):
         for i in range(n):
-            sizes[i] = 0
             for k in range(num_values):
-                memory[i * num_values + k] = beliefs[b, i, k]
                 if beliefs[b, i, k] > 0.0:
-                    support[i, sizes[i]] = k
-                    sizes[i] += 1
-        for o in range(programs.first[actions[b]], programs.first[actions[b] + 1]):
-            if programs.mixes[o]:
-                _mix_rows(programs, o, tables, memory, support, sizes, digits, starts, weights, kronecker, accumulator)
-            else:
-                _sum_products(programs, o, tables, memory, support, sizes, digits, offsets, accumulator, product)
-        for i in range(n):
-            start = (n + i) * num_values
-            total = 0.0
-            for k in range(num_values):
-                total += memory[start + k]
-            for k in range(num_values):
-                result[b, i, k] = memory[start + k] / total
+                    counts[b, i] += 1
+    kronecker, mixed = np.empty(BLOCK * MOST_WEIGHTS), np.empty((BLOCK, n, num_values))
+    start = 0
+    while start < number:
+        action = actions[order[start]]
+        stop = start
+        while stop < number and stop < start + BLOCK and actions[order[stop]] == action:
+            stop += 1
+        chosen = order[start:stop]
+        first, last = programs.first[action], programs.first[action + 1]
+        done = np.zeros(last - first, dtype=np.bool_)
+        for o in range(first, last):
+            if programs.mixes[o] and _is_dense(programs, o, counts, chosen, num_values):
+                _mix(programs, o, tables, beliefs, chosen, kronecker, mixed)
+                done[o - first] = True
+        for position in range(len(chosen)):
+            b = chosen[position]
+            for i in range(n):
+                sizes[i] = 0
+                for k in range(num_values):
+                    memory[i * num_values + k] = beliefs[b, i, k]
+                    if beliefs[b, i, k] > 0.0:
+                        support[i, sizes[i]] = k
+                        sizes[i] += 1
+            for o in range(first, last):
+                target = programs.target[o]
+                here = (n + target) * num_values
+                if done[o - first]:
+                    memory[here : here + num_values] = mixed[position, target]
+                elif programs.shared[o]:
+                    _sum(programs, o, tables, memory, support, sizes, loops, digits, places, weights, num_values)
+                else:
+                    _sum(programs, o, memory, memory, support, sizes, loops, digits, places, weights, num_values)
+                if programs.out[o] == here:
+                    # the marginal is the last that is made of a factor: from now on its support is known
+                    sizes[n + target] = 0
+                    for k in range(num_values):
+                        if memory[here + k] > 0.0:
+                            support[n + target, sizes[n + target]] = k
+                            sizes[n + target] += 1
+            for i in range(n):
+                here = (n + i) * num_values
+                total = 0.0
+                for k in range(num_values):
+                    total += memory[here + k]
+                for k in range(num_values):
+                    result[b, i, k] = memory[here + k] / total
+        start = stop
     return result
 
 
 class FactoredUpdates:
     """Belief updates of one model, planned once."""
 
-    def __init__(self, dbn: TwoSliceDBN, frontier: bool = False) -> None:
+    def __init__(self, dbn: TwoSliceDBN) -> None:
         """Plan the updates.
 
         Args:
             dbn: the model.
-            frontier: the factored frontier of Murphy and Weiss (2001): parents of slice t+1 count as independent of
-                each other and of those of slice t. Many times faster where such arcs are many, and not exact then;
-                the same where there are none.
 
         Raises:
             UserError: the model is too densely connected.
         """
         self.shape = (dbn.num_factors, dbn.num_values)
         self.num_actions = dbn.num_actions
-        self._programs = plan_updates(dbn, frontier)
+        self._programs = plan_updates(dbn)
         self._tables = np.array(dbn.probabilities).reshape(-1)
 
     def predict(self, beliefs: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """Marginals of the next factors for many beliefs, each a product of its rows; exact unless `frontier`.
+        """Marginals of the next factors for many beliefs, each a product of its rows, exactly.
 
         Args:
             beliefs: float [B, N, K], rows sum to 1.
@@ -253,7 +271,7 @@ class FactoredUpdates:
             raise UserError(f"an action lies in 0..{self.num_actions - 1}")
         if not (beliefs.min() >= 0 and beliefs.sum(axis=2).min() > 0):
             raise UserError("each row of a belief needs numbers >= 0, not all of them 0")
-        return np.asarray(_run(self._programs, self._tables, beliefs, actions))
+        return np.asarray(_run(self._programs, self._tables, beliefs, actions, np.argsort(actions, kind="stable")))
 
     def filter(self, beliefs: np.ndarray, actions: np.ndarray, likelihoods: np.ndarray) -> np.ndarray:
         """Factored filter: exact prediction, projection to its marginals, then Bayes' rule factor by factor.

@@ -19,6 +19,8 @@ from nesy.cli.benches.measuring import Row, Settings, rate
 
 NEEDS: tuple[str, ...] = ("extract",)
 BATCH = 64
+STEPS = 6
+"""Steps after which the beliefs of a filter are taken as those in use."""
 
 
 def measure(settings: Settings) -> list[Row]:
@@ -100,32 +102,35 @@ def _pyagrum(dbn: Any, action: int) -> tuple[Any, list[str]]:
 
 
 def _filtering(dbn: Any, name: str, settings: Settings, rng: np.random.Generator) -> list[Row]:
-    """Batched belief updates: prediction, likelihood, normalisation; from certain and from spread beliefs."""
+    """Batched exact belief updates: prediction, likelihood, normalisation.
+
+    From certain beliefs; from those of a filter that sees half of the factors at every step; from beliefs spread over
+    all values of all factors.
+    """
     from nesy.dbn.factored import FactoredUpdates
 
-    rows = []
     n, k = dbn.num_factors, dbn.num_values
+    updates = FactoredUpdates(dbn)
     likelihoods = rng.random((BATCH, n, k)) ** 4
     actions = rng.integers(dbn.num_actions, size=BATCH)
-    certain = np.eye(k)[_codes(dbn, rng, BATCH)]
-    spread = rng.dirichlet(np.full(k, 0.5), size=(BATCH, n))
-    for kind, frontier in (("exact", False), ("factored frontier", True)):
-        if kind == "factored frontier" and not any(ps for per_action in dbn.parents_next for ps in per_action):
-            continue
-        updates = FactoredUpdates(dbn, frontier)
-        for start, beliefs in (("certain", certain), ("spread", spread)):
-            if kind == "exact" and start == "spread" and name == "the run's model":
-                beliefs, batch = beliefs[:2], 2
-            else:
-                batch = BATCH
+    codes = _codes(dbn, rng, BATCH)
+    starts = {"certain": np.eye(k)[codes], "in use": np.eye(k)[codes]}
+    for _ in range(STEPS):
+        taken = rng.integers(dbn.num_actions, size=BATCH)
+        codes = dbn.sample(codes, taken, rng).astype(np.int64)
+        seen = np.where(rng.random((BATCH, n, 1)) < 0.5, np.eye(k)[codes], 1.0)
+        starts["in use"] = updates.filter(starts["in use"], taken, seen)
+    starts["spread"] = rng.dirichlet(np.full(k, 0.5), size=(BATCH, n))
+    rows = []
+    for start, beliefs in starts.items():
 
-            def work(updates: Any = updates, beliefs: np.ndarray = beliefs, batch: int = batch) -> int:
-                updates.filter(beliefs, actions[:batch], likelihoods[:batch])
-                return batch
+        def work(beliefs: np.ndarray = beliefs) -> int:
+            updates.filter(beliefs, actions, likelihoods)
+            return BATCH
 
-            what = f"filtering, {kind}, {start} beliefs, {name}"
-            figure = rate(work, settings.seconds)
-            rows.append(Row(what, figure, "updates/s", "100,000 updates/s", figure / 1e5))
+        figure = rate(work, settings.seconds)
+        what = f"filtering, {start} beliefs, {name}"
+        rows.append(Row(what, figure, "updates/s", "100,000 updates/s", figure / 1e5))
     return rows
 
 

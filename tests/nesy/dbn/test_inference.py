@@ -143,9 +143,12 @@ def test_wrong_arguments_are_named():
 @given(seeds)
 def test_batched_prediction_is_the_exact_one(seed):
     rng = np.random.default_rng(seed)
-    dbn = random_dbn(rng, num_factors=4, max_parents=3, zeros=seed % 2 == 0)
+    dbn = random_dbn(rng, num_factors=5, max_parents=3, zeros=seed % 2 == 0)
+    # certain, spread, and in between; more than one block of the same action
     beliefs = np.stack([random_belief(rng, dbn) for _ in range(6)])
-    actions = rng.integers(0, 2, size=6)
+    beliefs[1] = np.eye(3)[rng.integers(0, 3, size=5)]
+    beliefs = beliefs[rng.integers(0, 6, size=80)]
+    actions = rng.integers(0, 2, size=80)
     expected = [dbn.predict(belief, action) for belief, action in zip(beliefs, actions, strict=True)]
     np.testing.assert_allclose(FactoredUpdates(dbn).predict(beliefs, actions), expected, atol=1e-12)
 
