@@ -11,6 +11,7 @@ evaluation. Differences are paired (the same maps and seeds for all); intervals 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -67,9 +68,9 @@ class Arguments:
 class Watched(Player):
     """A player whose forbidden actions are counted."""
 
-    def __init__(self, player: Player, domain: Domain) -> None:
+    def __init__(self, player: Player, watch: Watch) -> None:
         super().__init__(player.agent, player.perception, player.mask, player.codec)
-        self.watch = Watch(domain)
+        self.watch = watch
 
     def decide(self, env: Any, observation: Any, active: np.ndarray, last: np.ndarray | None) -> Any:
         """As the player does."""
@@ -107,19 +108,21 @@ def main() -> None:
     results: dict[str, dict[str, Any]] = {}
     returns: dict[str, np.ndarray] = {}
 
-    def play(name: str, agent: Agent, shielded: bool, least_steps: int, episodes: int) -> None:
+    def play(name: str, agent: Callable[[int], Agent], shielded: bool, least_steps: int, episodes: int) -> None:
         perception = Perception(codec, options.influence, np.random.default_rng([options.seed, 1]))
-        player = Watched(Player(agent, perception, mask if shielded else None), domain)
+        watch = Watch(domain)
         parts: list[dict[str, np.ndarray]] = []
-        while player.watch.steps < least_steps or 168 * len(parts) < episodes:
-            parts.append(evaluate(domain, "paper", player, 168, options.seed + len(parts)))
+        while watch.steps < least_steps or 168 * len(parts) < episodes:
+            seed = options.seed + len(parts)
+            player = Watched(Player(agent(seed), perception, mask if shielded else None), watch)
+            parts.append(evaluate(domain, "paper", player, 168, seed))
         gains = np.concatenate([part["return"] for part in parts])
         success = np.concatenate([part["outcome"] for part in parts]) == domain.spec.outcomes.index("success")
         returns[name], returns[name + "/success"] = gains, success.astype(float)
         results[name] = {
-            "steps": player.watch.steps,
-            "into_walls": player.watch.into_walls,
-            "into_person": player.watch.into_person,
+            "steps": watch.steps,
+            "into_walls": watch.into_walls,
+            "into_person": watch.into_person,
             "episodes": len(gains),
             "return": _interval(gains, options.seed),
             "success": _interval(success.astype(float), options.seed),
@@ -149,14 +152,18 @@ def main() -> None:
             print(json.dumps({f"dqn training {trained}": results[f"dqn training {trained}"]}), flush=True)
             for acting in (False, True):
                 name = f"dqn trained {trained}, acting {'shielded' if acting else 'free'}"
-                play(name, DQNAgent(policy), acting, options.steps, 0)
+                play(name, lambda seed, policy=policy: DQNAgent(policy), acting, options.steps, 0)
     if "search" in options.agents:
         model = IALM.load(run.ialm)
         config = SearchConfig(simulations=options.simulations)
+
+        def planner(seed: int) -> Agent:
+            # random streams of its own in every part: the same maps come again
+            return PlanningAgent("search", model, config, domain.spec.geometry, seed)
+
         for shielded in (False, True):
-            agent = PlanningAgent("search", model, config, domain.spec.geometry, options.seed)
             name = f"search acting {'shielded' if shielded else 'free'}"
-            play(name, agent, shielded, options.steps if shielded else 0, options.unshielded_episodes)
+            play(name, planner, shielded, options.steps if shielded else 0, options.unshielded_episodes)
     pairs = (
         ("dqn trained free, acting free", "dqn trained free, acting shielded"),
         ("dqn trained free, acting free", "dqn trained shielded, acting shielded"),
