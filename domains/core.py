@@ -162,6 +162,10 @@ class BatchedEnvironment(Protocol):
         """`[B]`: the person's last action (0 left, 1 right, 2 forward, 3 wait); -1 after a reset."""
         ...
 
+    def person_minds(self) -> NDArray[np.int16]:
+        """`[B, 2, 2]`: (side, ahead) from the robot of where the person believes its goal to be, and where it is."""
+        ...
+
     def counters(self) -> NDArray[np.int16]:
         """`[B, 2]`: the waiting counter and the lost counter."""
         ...

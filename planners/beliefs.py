@@ -105,6 +105,11 @@ class ParticleBelief:
             self.states[renewed, n : 2 * n] = self._draw_codes(prior, int(renewed.sum()))
         return float(np.log(total / len(weights)))
 
+    @property
+    def window(self) -> int:
+        """W of `pose_marginal`."""
+        return self.model.motion.window
+
     def pose_marginal(self) -> np.ndarray:
         """P(c): float64 [2W + 1, 2W + 1, 4] over side, ahead, heading (for pictures)."""
         n, size = self.model.num_factors, 2 * self.model.motion.window + 1

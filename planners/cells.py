@@ -140,7 +140,14 @@ def _planner(cell: Cell, run: RunFolder, domain: Domain, config: CompareConfig, 
     from planners.compare import ialm_folder
     from planners.ialm import IALM
 
-    model = IALM.load(ialm_folder(run, cell.variant))
+    home = ialm_folder(run, cell.variant)
+    if cell.agent == "search" and (home / "minds.json").is_file():
+        from planners.mind_agent import MindAgent
+        from planners.minds import MindModel
+
+        minds = MindModel.load(home)
+        return MindAgent(minds, codec, cell.influence, config.search_of_cells, domain.spec.geometry, seed)
+    model = IALM.load(home)
     if config.rules:
         from planners.influence_rules import constrain_influence
 

@@ -14,7 +14,7 @@ import numpy as np
 from domains.core import Domain
 from nesy.errors import UserError
 from nesy.run_folder import RunFolder
-from planners.agents import DQNAgent, PlanningAgent, Situation
+from planners.agents import DQNAgent, Situation
 from planners.cells import restored_player
 from planners.compare import Cell, grid
 from planners.config import CompareConfig
@@ -135,7 +135,6 @@ def _values(
 ) -> tuple[dict[str, float], dict[str, int]]:
     if isinstance(agent, DQNAgent):
         return dict(zip(names, map(float, agent.policy.values(percepts)[0]), strict=True)), {}
-    assert isinstance(agent, PlanningAgent)
     info: dict[str, Any] = agent.infos[0]
     visits = [int(v) for v in info["visits"]]
     # a planner under rules may list the allowed actions only

@@ -27,6 +27,8 @@ from planners import config as settings
 from planners.config import CompareConfig, SearchConfig
 from planners.evaluation import Columns, evaluate, outcome_names
 
+MINDS_VERSION = 1
+"""Of what is learned where minds matter (planners.minds)."""
 EVALUATION_SEED = 20_250_420
 """Seed of all evaluation episodes, whatever the seed of the run: results of different runs compare."""
 
@@ -171,6 +173,7 @@ def ensure_ialm(
         "practice_episodes": config.practice_episodes,
         "practice_mixture": config.practice_mixture,
         "discount": config.discount,
+        "minds": MINDS_VERSION,
     }
     home = ialm_folder(run, variant)
     path = home / "model.json"
@@ -181,8 +184,10 @@ def ensure_ialm(
     from nesy.experience import Experience
     from nesy.world_model import SymbolicCodec, load_world_model
     from planners.ialm_learning import joined, learn_ialm
+    from planners.mind_learning import learn_minds, several_goals
 
     experience = Experience.load(run.experience)
+    here = [experience] if _variant_of(run) in (None, variant) else []
     if config.practice_episodes:
         folder = home / "practice"
         if path.is_file():
@@ -190,10 +195,21 @@ def ensure_ialm(
         collect_following(
             domain, config.practice_episodes, config.practice_mixture, folder, seed, progress, variant=variant
         )
-        experience = joined(experience, Experience.load(folder))
+        practice = Experience.load(folder)
+        here = [joined(here[0], practice) if here else practice]
+        experience = joined(experience, practice)
     codec = SymbolicCodec(load_world_model(run.world_model))
+    for name in ("minds.json", "minds.npz"):
+        (home / name).unlink(missing_ok=True)
+    if here and several_goals(here[0]):
+        learn_minds(codec, here[0], provenance).save(home)
     model = learn_ialm(TwoSliceDBN.load(run.dbn), codec, experience, provenance, config.discount)
     model.save(home)
+
+
+def _variant_of(run: RunFolder) -> str | None:
+    """The variant that the run's own experience is of; None where the run does not say."""
+    return str(read_json(run.config)["variant"]) if run.config.is_file() else None
 
 
 def ialm_folder(run: RunFolder, variant: str) -> Path:

@@ -144,6 +144,10 @@ class SearchConfig:
     """Person-following episodes, besides the run's experience, that the planner's tables are learned from."""
     practice_mixture: float = 0.3
     """Probability that the switching behaviour of these episodes acts at random."""
+    mind_discount: float = 0.99
+    """Discount per step where minds matter (several goals): what pays there pays late."""
+    mind_exploration: float = 40.0
+    """Weight of the exploration term there, in units of reward."""
     pomdp_py_simulations: int = 150
     """Simulations per decision of pomdp-py's POUCT, which is far slower per simulation."""
 

@@ -17,6 +17,7 @@ from planners.ialm import IALM
 from planners.kernels import Model
 from planners.random_bits import stream
 from planners.tree import allocate, clear
+from planners.tree_top import in_words
 from planners.walk import LocalModel, best_tried, walks
 
 
@@ -68,6 +69,13 @@ class IALMSearch:
         )
         info["distinct"] = len(np.unique(belief, axis=0))
         return best_tried(info, mask), info
+
+    def describe(self, seen: int) -> str:
+        """An observation of the tree in words: the robot's motion, and the person's pose if in view (planners.walk)."""
+        pose, motion = seen // 4 - 1, self.model.dbn.action_names[seen % 4]
+        window = self.model.motion.window
+        where = "not in view" if pose < 0 else in_words(pose // 4 // 512 - window, pose // 4 % 512 - window)
+        return f"after {motion}: {where}"
 
     def draw(self, depth: int = 3, format: Literal["dot", "svg"] = "dot") -> str:
         """The tree of the last `plan`, down to `depth` steps, as DOT or SVG text."""

@@ -65,15 +65,15 @@ class RelativeMotion:
 
 
 def learn_motion(experience: Experience) -> tuple[RelativeMotion, np.ndarray]:
-    """Learn the maps, and find out which `forward` actions moved the robot.
+    """Learn the maps, and find out which actions moved the robot.
 
-    A `forward` that changes the pose just as `stay` would have done did not move the robot.
+    An action that changes the pose just as `stay` would have done did not move the robot.
 
     Args:
         experience: person-following transitions.
 
     Returns:
-        The maps, and bool [n]: whether the robot moved (true for every other action).
+        The maps, and bool [n]: whether the robot moved (true for every `stay`).
     """
     before = experience.relative_pose.astype(np.int64)
     after = experience.next_relative_pose.astype(np.int64)
@@ -85,13 +85,11 @@ def learn_motion(experience: Experience) -> tuple[RelativeMotion, np.ndarray]:
         np.zeros((*shape, 2, 3), np.int64), np.zeros(shape, np.int64), np.zeros((*shape, 2), np.int64), window
     )
     moved = np.ones(len(action), np.bool_)
-    for m in (0, 1, STAY):
-        _fit(motion, m, before, after, move, action == m)
-    forward = action == FORWARD
-    moved[forward] = (motion.apply(before[forward], np.full(forward.sum(), STAY), move[forward]) != after[forward]).any(
-        1
-    )
-    _fit(motion, FORWARD, before, after, move, forward & moved)
+    _fit(motion, STAY, before, after, move, action == STAY)
+    acted = action != STAY
+    moved[acted] = (motion.apply(before[acted], np.full(acted.sum(), STAY), move[acted]) != after[acted]).any(1)
+    for m in (0, 1, FORWARD):
+        _fit(motion, m, before, after, move, (action == m) & moved)
     _compose(motion)
     return motion, moved
 

@@ -33,7 +33,7 @@ from planners.evaluation import evaluation_maps
 from planners.perception import Perception, Percepts
 from planners.replay_choice import MOST_EPISODES, Chosen, all_reasons, choose
 from planners.tree import Tree
-from planners.tree_top import top_of_flat_tree, top_of_pomdp_py_tree
+from planners.tree_top import in_words, top_of_flat_tree, top_of_pomdp_py_tree
 
 FORMAT, VERSION = "nesy-replays", 1
 RULE = (
@@ -276,35 +276,25 @@ def _thoughts(agent: Agent, percepts: Percepts, i: int) -> dict[str, Any]:
         "values": [round(float(value), 3) for value in info["values"]],
         "visits": [int(count) for count in info["visits"]],
         "simulations": int(info["simulations"]),
-        "tree": _tree_of(planner, belief.model.motion.window, belief.model.dbn.action_names),
-        "where": _places(belief.pose_marginal(), belief.model.motion.window),
+        "tree": _tree_of(planner, belief.window),
+        "where": _places(belief.pose_marginal(), belief.window),
         "person": _distributions(belief.person_marginals()),
     }
     return {"plan": plan}
 
 
-def _tree_of(planner: Any, window: int, action_names: Sequence[str]) -> dict[str, Any] | None:
+def _tree_of(planner: Any, window: int) -> dict[str, Any] | None:
     """The top of the last search's tree, its observations in words."""
-
-    def place(side: int, ahead: int) -> str:
-        across = f"{abs(side)} {'right' if side > 0 else 'left'}" if side else ""
-        along = f"{abs(ahead)} {'ahead' if ahead > 0 else 'behind'}" if ahead else ""
-        return ", ".join(filter(None, (across, along))) or "same cell"
-
-    def of_walk(seen: int) -> str:  # see planners.walk: the robot's motion, and the person's pose if in view
-        pose, motion = seen // 4 - 1, action_names[seen % 4]
-        where = "not in view" if pose < 0 else place(pose // 4 // 512 - window, pose // 4 % 512 - window)
-        return f"after {motion}: {where}"
 
     def of_adapter(seen: Any) -> str:
         side, ahead, _ = seen.pose
-        where = "not in view" if side < 0 else place(side - window, ahead - window)
+        where = "not in view" if side < 0 else in_words(side - window, ahead - window)
         return where if not seen.outcome else f"{where}, the end"
 
     if getattr(planner, "root", None) is not None:
         return top_of_pomdp_py_tree(planner.root, of_adapter)
     tree = getattr(planner, "tree", None)
-    return top_of_flat_tree(tree, of_walk) if isinstance(tree, Tree) else None
+    return top_of_flat_tree(tree, planner.describe) if isinstance(tree, Tree) else None
 
 
 def _rules(shield: Any, percepts: Percepts, domain: Domain, i: int) -> dict[str, Any]:

@@ -16,6 +16,13 @@ import numpy as np
 from planners.tree import Tree
 
 
+def in_words(side: int, ahead: int) -> str:
+    """A relative place in words."""
+    across = f"{abs(side)} {'right' if side > 0 else 'left'}" if side else ""
+    along = f"{abs(ahead)} {'ahead' if ahead > 0 else 'behind'}" if ahead else ""
+    return ", ".join(filter(None, (across, along))) or "same cell"
+
+
 def top_of_flat_tree(tree: Tree, name: Callable[[int], str], levels: int = 2, most: int = 3) -> dict[str, Any]:
     """The top `levels` levels of a tree in flat arrays.
 

@@ -23,6 +23,7 @@ from planners import ialm
 from planners.code_sampling import CodeSampler, next_code
 from planners.ialm import SCALARS
 from planners.kernels import Model, step
+from planners.mind_walk import mind_advance, mind_begin, mind_room
 from planners.random_bits import uniform
 from planners.tree import NO_CHILD, Tree, backup, backup_best, best_by_ucb, find_child
 
@@ -180,6 +181,7 @@ _KINDS: dict[str, tuple[Callable[..., Any], Callable[..., Any], Callable[..., An
     "PackedPOMDP": (_tabular_room, _tabular_begin, _tabular_advance),
     "FactoredModel": (_factored_room, _factored_begin, _factored_advance),
     "LocalModel": (_local_room, _local_begin, _local_advance),
+    "MindTree": (mind_room, mind_begin, mind_advance),
 }
 
 

@@ -14,7 +14,19 @@ from numpy.typing import NDArray
 from domains.core import OUTCOMES, DomainError, ViewGeometry
 from domains.person_following.batch import NUM_ACTIONS, Batch, checked_actions, checked_task, observation_space
 from domains.person_following.variants import Parameters, parameters_of
-from domains.person_following.world import LAST_ACTION, LOST, TIME, WAITING
+from domains.person_following.world import (
+    BELIEVED_X,
+    BELIEVED_Y,
+    GOAL_X,
+    GOAL_Y,
+    HEADING,
+    LAST_ACTION,
+    LOST,
+    TIME,
+    WAITING,
+    X,
+    Y,
+)
 
 _OUTCOME_NAMES = np.array(OUTCOMES)
 
@@ -119,6 +131,14 @@ class PersonFollowingVectorEnv(VectorEnv):
     def person_actions(self) -> NDArray[np.int8]:
         """`[B]`: what each person did in the last step (3: waited); -1 after a reset."""
         return self.batch.world.person[:, LAST_ACTION].astype(np.int8)
+
+    def person_minds(self) -> NDArray[np.int16]:
+        """`[B, 2, 2]`: (side, ahead) from the robot of where the person believes its goal to be, and where it is."""
+        person, robot = self.batch.world.person, self.batch.world.robot
+        places = person[:, [[BELIEVED_X, BELIEVED_Y], [GOAL_X, GOAL_Y]]] - robot[:, None, [X, Y]]
+        ahead = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])[robot[:, HEADING]][:, None]
+        side = np.stack([-ahead[..., 1], ahead[..., 0]], axis=-1)
+        return np.stack([(places * side).sum(-1), (places * ahead).sum(-1)], axis=-1).astype(np.int16)
 
     def counters(self) -> NDArray[np.int16]:
         """`[B, 2]`: waiting and lost counters."""
