@@ -3,8 +3,9 @@
 episodes (all seeds pooled) -> records (means, interquartile means, intervals, regret, share of the optimum)
                             -> comparison.parquet .csv .md .tex, regret.parquet .csv, statistics.json, plots
 
-Intervals: stratified by map where maps come more than once, since every agent meets the same ones; for agents that
-learn, with three seeds or more, over seeds, since the episodes of one training have that training in common.
+Intervals: stratified by map where maps come more than once, since every agent meets the same ones; where each comes
+once, of what is short of the optimum there, which is known exactly; for agents that learn, with three seeds or more,
+over seeds, since the episodes of one training have that training in common.
 """
 
 from __future__ import annotations
@@ -110,14 +111,24 @@ def _groups(episodes: pa.Table, phase: str) -> dict[tuple[str, ...], dict[str, n
     return {key: {name: column[rows] for name, column in columns.items()} for key, rows in groups.items()}
 
 
-def _interval(values: np.ndarray, rows: dict[str, np.ndarray], config: CompareConfig, robust: bool = False) -> Interval:
+def _interval(
+    values: np.ndarray,
+    rows: dict[str, np.ndarray],
+    config: CompareConfig,
+    robust: bool = False,
+    best: np.ndarray | None = None,
+) -> Interval:
+    """Mean (or interquartile mean) of `values`; `best` is what the optimum gets in each of these episodes."""
     seeds = rows["seed"]
     if rows["experience_steps"].max() > 0 and len(np.unique(seeds)) >= 3 and not robust:
         return over_seeds(values, seeds, 0, config.confidence)
     statistic = interquartile_mean if robust else np.mean
-    if np.unique(rows["map_id"], return_counts=True)[1].min() < 2:  # nothing to resample within a map
+    if np.unique(rows["map_id"], return_counts=True)[1].min() >= 2:
+        return stratified_bootstrap(values, rows["map_id"], 0, config.confidence, statistic)
+    if best is None or robust:  # nothing to resample within a map
         return bootstrap(values, 0, config.confidence, statistic)
-    return stratified_bootstrap(values, rows["map_id"], 0, config.confidence, statistic)
+    short = bootstrap(best - values, 0, config.confidence)
+    return Interval(float(values.mean()), float(best.mean()) - short.high, float(best.mean()) - short.low)
 
 
 def _record(
@@ -125,8 +136,8 @@ def _record(
 ) -> dict[str, Any]:
     returns, success = rows["return"], (rows["outcome"] == "success").astype(np.float64)
     optimum = optima.get(rows["variant"][0])
-    mean_return = _interval(returns, rows, config).as_dict()
-    mean_success = _interval(success, rows, config).as_dict()
+    mean_return = _interval(returns, rows, config, best=_best(rows, optimum, "return")).as_dict()
+    mean_success = _interval(success, rows, config, best=_best(rows, optimum, "success")).as_dict()
     record: dict[str, Any] = dict(zip(CONDITION, (str(part) for part in condition), strict=True))
     if record["agent"] == "optimum" and optimum is not None:
         mean_return, mean_success = _exact(optimum["mean_return"]), _exact(optimum["success"])
@@ -135,7 +146,7 @@ def _record(
         for name, column in rows.items()
         if name not in METRICS_OF_NO_EPISODE and column.dtype.kind in "fi" and not np.isnan(column.astype(float)).all()
     }
-    regret = _regret_of(rows, optimum)
+    best = _best(rows, optimum, "return")
     return {
         **record,
         "seeds": [int(seed) for seed in np.unique(rows["seed"])],
@@ -146,7 +157,7 @@ def _record(
         "ms_per_decision": float(np.median(rows["ms_per_decision"])),
         "experience_steps": int(rows["experience_steps"].max()),
         "share_of_optimum": None if optimum is None else mean_return["mean"] / optimum["mean_return"],
-        "regret": None if regret is None else _interval(regret, rows, config).as_dict(),
+        "regret": None if best is None else _interval(best - returns, rows, config).as_dict(),
         "metrics": metrics,
     }
 
@@ -155,12 +166,12 @@ def _exact(value: float) -> dict[str, Any]:
     return {"mean": value, "low": None, "high": None}
 
 
-def _regret_of(rows: dict[str, np.ndarray], optimum: Optimum | None) -> np.ndarray | None:
-    """What the exact optimum gets more on the map of each episode; None where its maps are not known."""
-    known = {} if optimum is None else {entry["map_id"]: entry["return"] for entry in optimum["maps"]}
+def _best(rows: dict[str, np.ndarray], optimum: Optimum | None, what: str) -> np.ndarray | None:
+    """What the exact optimum gets on the map of each episode; None where its maps are not known."""
+    known = {} if optimum is None else {entry["map_id"]: entry[what] for entry in optimum["maps"]}
     if not known or not all(int(name) in known for name in rows["map_id"]):
         return None
-    return np.array([known[int(name)] for name in rows["map_id"]]) - rows["return"]
+    return np.array([known[int(name)] for name in rows["map_id"]])
 
 
 def _regrets(
@@ -168,7 +179,7 @@ def _regrets(
 ) -> list[dict[str, Any]]:
     """One row per map: what the condition got, and the optimum."""
     optimum = optima.get(rows["variant"][0])
-    if _regret_of(rows, optimum) is None or optimum is None:
+    if _best(rows, optimum, "return") is None or optimum is None:
         return []
     found = []
     for entry in optimum["maps"]:
@@ -235,7 +246,8 @@ def _curve(condition: tuple[str, ...], rows: dict[str, np.ndarray], config: Comp
     length = min(len(returns) for returns in per_seed)
     window = min(200, max(length // 50, 1))
     at = np.unique(np.linspace(window - 1, length - 1, min(MOST_POINTS, length)).astype(int))
-    curve: dict[str, Any] = {"name": _name(condition), "seeds": len(seeds), "episodes": length, "window": window}
+    curve: dict[str, Any] = {"name": _name(condition), "variant": condition[3]}
+    curve |= {"seeds": len(seeds), "episodes": length, "window": window}
     curve["episode"] = (at + 1).tolist()
     steps = [rows["step"][rows["seed"] == seed] for seed in seeds]
     curve["steps"] = np.mean([taken[at] for taken in steps], axis=0).tolist()

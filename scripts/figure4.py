@@ -24,7 +24,7 @@ import tyro
 
 from nesy.errors import UserError
 from nesy.progress import ConsoleProgress
-from nesy.report.comparison_figures import learning, save
+from nesy.report.comparison_figures import learning, optima, save
 from nesy.run_folder import RunFolder, read_json, write_json
 from planners.compare import compare
 from planners.config import CompareConfig, DQNConfig
@@ -106,9 +106,8 @@ def make(options: Arguments) -> dict[str, Any]:
     curves = read_json(output.results / "statistics.json")["curves"]
     for curve in curves:
         curve["name"] = next(mode for mode in options.modes if f"/ {mode} /" in curve["name"])
-    optimum = next(record["return"]["mean"] for record in records if record["agent"] == "optimum")
     notes = (f"Bands: 95 % over {len(options.seeds)} seeds. {result['ranking']}", PUBLISHED)
-    save(learning(curves, optimum, notes), options.output / "figure4")
+    save(learning(curves, optima(records), notes), options.output / "figure4")
     return result
 
 

@@ -5,7 +5,8 @@ Every figure says how many seeds and episodes are in it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from nesy.report.figures import PALETTE
 from nesy.run_folder import atomic_path
 
 Curve = dict[str, Any]
-"""`name`, `seeds`, `episodes`, `window`, `episode` [P], and `policy` and `running_average`: mean, low, high [P]."""
+"""`name`, `variant`, `seeds`, `episodes`, `window`, `episode` [P]; `policy`, `running_average`: mean, low, high [P]."""
 
 
 def save_figures(folder: Path, records: Sequence[dict[str, Any]], statistics: dict[str, Any]) -> None:
@@ -29,11 +30,15 @@ def save_figures(folder: Path, records: Sequence[dict[str, Any]], statistics: di
     figures = {"returns": returns(records), "profiles": profiles(statistics["profiles"])}
     if statistics["improvement"]:
         figures["improvement"] = improvement(statistics["improvement"])
-    optimum = next((record["return"]["mean"] for record in records if record["agent"] == "optimum"), None)
     if statistics["curves"]:
-        figures["learning"] = learning(statistics["curves"], optimum)
+        figures["learning"] = learning(statistics["curves"], optima(records))
     for name, figure in figures.items():
         save(figure, folder / name)
+
+
+def optima(records: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """Mean return of the exact optimum by variant, where it is among the agents compared."""
+    return {record["variant"]: record["return"]["mean"] for record in records if record["agent"] == "optimum"}
 
 
 def save(figure: Figure, path: Path) -> None:
@@ -46,7 +51,7 @@ def save(figure: Figure, path: Path) -> None:
 
 def returns(records: Sequence[dict[str, Any]]) -> Figure:
     """Mean return (circle) and interquartile mean (diamond) of every condition; exact optima as dotted lines."""
-    figure, axes = _axes(8, 0.42 * len(records) + 1.0)
+    figure, axes = _axes(8, 0.34 * len(records) + 1.0)
     agents = list(dict.fromkeys(record["agent"] for record in records))
     for row, record in enumerate(records):
         colour = PALETTE[agents.index(record["agent"]) % len(PALETTE)]
@@ -54,38 +59,53 @@ def returns(records: Sequence[dict[str, Any]]) -> Figure:
             if interval.get("low") is not None:
                 axes.plot([interval["low"], interval["high"]], [row + shift] * 2, color=colour, linewidth=1.5)
             axes.plot(interval["mean"], row + shift, mark, color=colour, markersize=4)
-        if record["agent"] == "optimum":
-            axes.axvline(record["return"]["mean"], color="#000000", linestyle=":", linewidth=1)
+    for variant, optimum in optima(records).items():
+        rows = [row for row, record in enumerate(records) if record["variant"] == variant]
+        axes.plot([optimum] * 2, [min(rows) - 0.5, max(rows) + 0.5], color="#000000", linestyle=":", linewidth=1)
     labels = [f"{_name(record)}  ({_counted(len(record['seeds']), record['episodes'])})" for record in records]
     axes.set_yticks(range(len(records)), labels, fontsize=8)
-    axes.invert_yaxis()
-    axes.set_xlabel("return: mean (circle), interquartile mean (diamond), 95 % intervals; dotted: exact optimum")
+    axes.set_ylim(len(records) - 0.4, -0.6)
+    axes.set_xlabel("return: mean (circle), interquartile mean (diamond), 95 % intervals;\ndotted: exact optimum")
     return figure
 
 
 def profiles(statistics: dict[str, Any]) -> Figure:
-    """Share of the episodes with a return above each threshold."""
-    figure, axes = _axes(8, 4)
-    for position, (name, shares) in enumerate(statistics["shares"].items()):
-        label = f"{name} ({_counted(statistics['seeds'][name], statistics['episodes'][name])})"
-        style = ("-", "--", ":")[position // len(PALETTE) % 3]
-        axes.plot(statistics["thresholds"], shares, style, color=PALETTE[position % len(PALETTE)], label=label)
-    axes.set_xlabel("return")
-    axes.set_ylabel("share of episodes above")
-    axes.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    """Share of episodes with a return above each threshold: a panel per variant, colours by agent, dashes by mode."""
+    names = [name.split(" / ") for name in statistics["shares"]]
+    variants, agents = (list(dict.fromkeys(name[at] for name in names)) for at in (-1, 0))
+    inside = [tuple(name[1:-1]) for name in names]
+    dashes = dict(zip(dict.fromkeys(inside), cycle(("-", "--", ":", "-.")), strict=False))
+    figure = Figure(figsize=(9, 3.2 * len(variants)), layout="constrained")
+    panels = figure.subplots(len(variants), 1, squeeze=False)[:, 0]
+    for axes, variant in zip(panels, variants, strict=True):
+        entries = statistics["shares"].items()
+        for (name, shares), parts, condition in zip(entries, names, inside, strict=True):
+            if parts[-1] == variant:
+                label = (
+                    f"{' / '.join(parts[:-1])} ({_counted(statistics['seeds'][name], statistics['episodes'][name])})"
+                )
+                colour = PALETTE[agents.index(parts[0]) % len(PALETTE)]
+                axes.plot(statistics["thresholds"], shares, dashes[condition], color=colour, label=label, linewidth=1.2)
+        axes.set_title(variant, fontsize=9)
+        axes.set_xlabel("return")
+        axes.set_ylabel("share of episodes above")
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
 
 
 def improvement(pairs: Sequence[dict[str, Any]]) -> Figure:
     """Probability that an episode of the row's agent beats one of the column's."""
     ours = list(dict.fromkeys(pair["ours"] for pair in pairs))
-    figure, axes = _axes(0.55 * len(ours) + 2.5, 0.45 * len(ours) + 1.5)
+    figure, axes = _axes(0.45 * len(ours) + 2.5, 0.36 * len(ours) + 1.5)
     table = np.full((len(ours), len(ours)), np.nan)
     for pair in pairs:
         table[ours.index(pair["ours"]), ours.index(pair["theirs"])] = pair["mean"]
     axes.imshow(np.ma.masked_invalid(table), cmap="RdBu", vmin=0, vmax=1)
     for row, column in np.argwhere(~np.isnan(table)):
-        axes.text(column, row, f"{table[row, column]:.2f}", ha="center", va="center", fontsize=6)
+        value = table[row, column]
+        colour = "#ffffff" if abs(value - 0.5) > 0.3 else "#000000"  # both ends of the scale are dark
+        axes.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=6, color=colour)
     axes.set_xticks(range(len(ours)), ours, rotation=90, fontsize=7)
     axes.set_yticks(range(len(ours)), ours, fontsize=7)
     axes.grid(visible=False)
@@ -93,35 +113,39 @@ def improvement(pairs: Sequence[dict[str, Any]]) -> Figure:
     return figure
 
 
-def learning(curves: Sequence[Curve], optimum: float | None = None, notes: Sequence[str] = ()) -> Figure:
-    """Learning curves with bands: the policy's (left) and the running average over all episodes (right).
+def learning(curves: Sequence[Curve], optima: Mapping[str, float], notes: Sequence[str] = ()) -> Figure:
+    """Learning curves with bands, a row per variant: the policy's (left), the average over all episodes so far (right).
 
     Args:
         curves: one per condition.
-        optimum: the exact optimum, drawn as a dotted line.
+        optima: the exact optimum by variant, drawn as a dotted line.
         notes: lines of text under the figure.
     """
-    figure = Figure(figsize=(11, 4.2), layout="constrained")
-    panels = figure.subplots(1, 2)
-    titles = (
-        ("policy", f"policy: mean of the last {curves[0]['window']} training episodes"),
-        ("running_average", "running average over all training episodes so far"),
-    )
-    for axes, (which, title) in zip(panels, titles, strict=True):
-        for position, curve in enumerate(curves):
-            colour = PALETTE[position % len(PALETTE)]
-            label = f"{curve['name']} ({_counted(curve['seeds'], curve['episodes'])})"
-            band = curve[which]
-            axes.plot(curve["episode"], band["mean"], color=colour, label=label)
-            if curve["seeds"] > 1:
-                axes.fill_between(curve["episode"], band["low"], band["high"], color=colour, alpha=0.2, linewidth=0)
-        if optimum is not None:
-            axes.axhline(optimum, color="#000000", linestyle=":", linewidth=1, label="exact optimum")
-        axes.set_title(title, fontsize=9)
-        axes.set_xlabel("training episode")
-        axes.set_ylabel("return")
-        axes.grid(alpha=0.3)
-    panels[0].legend(fontsize=7, loc="upper left")
+    variants = list(dict.fromkeys(curve.get("variant", "") for curve in curves))
+    figure = Figure(figsize=(11, 4.4 * len(variants)), layout="constrained")
+    rows = figure.subplots(len(variants), 2, squeeze=False)
+    for panels, variant in zip(rows, variants, strict=True):
+        mine = [curve for curve in curves if curve.get("variant", "") == variant]
+        titles = (
+            ("policy", f"{variant}, policy: mean of the last {mine[0]['window']} training episodes"),
+            ("running_average", f"{variant}, running average over all training episodes so far"),
+        )
+        for axes, (which, title) in zip(panels, titles, strict=True):
+            for position, curve in enumerate(mine):
+                colour = PALETTE[position % len(PALETTE)]
+                label = f"{curve['name']} ({_counted(curve['seeds'], curve['episodes'])})"
+                band = curve[which]
+                axes.plot(curve["episode"], band["mean"], color=colour, label=label, linewidth=1.2)
+                if curve["seeds"] > 1:
+                    axes.fill_between(curve["episode"], band["low"], band["high"], color=colour, alpha=0.2, linewidth=0)
+            if variant in optima:
+                axes.axhline(optima[variant], color="#000000", linestyle=":", linewidth=1, label="exact optimum")
+            axes.set_title(title, fontsize=9)
+            axes.set_xlabel("training episode")
+            axes.set_ylabel("return")
+            axes.grid(alpha=0.3)
+        # On the right all curves start low and stay below: room in the corner above.
+        panels[1].legend(fontsize=7, loc="upper left", bbox_to_anchor=(0.0, 0.97))
     if notes:
         figure.supxlabel("\n".join(notes), fontsize=7)
     return figure

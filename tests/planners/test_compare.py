@@ -117,6 +117,11 @@ def test_every_metric_is_a_column_and_every_table_is_written(tmp_path: Path, mon
     assert record["regret"]["mean"] == pytest.approx(100 - record["return"]["mean"])
     assert record["interquartile_mean"]["mean"] > record["return"]["mean"]  # a fifth of the maps is out of reach
     assert record["metrics"]["success"] == pytest.approx(record["success"]["mean"])
+    # With every map once there is still no doubt which map is easy: what is uncertain is what is short of the optimum.
+    (once,) = compare(run, CompareConfig(agents=("greedy-follower",), episodes=42))
+    for outer, inner in (("low", "high"), ("high", "low")):
+        assert once["return"][outer] == pytest.approx(100 - once["regret"][inner])
+    (record,) = compare(run, CompareConfig(agents=("greedy-follower",), episodes=84))
     regret = pq.read_table(run.results / "regret.parquet").to_pydict()
     assert len(set(regret["map_id"])) == 42
     assert set(regret["episodes"]) == {2}
