@@ -27,6 +27,10 @@ class Arguments:
     """Show this factor: its tables, and a picture of what each of its values looks like."""
     action: str | None = None
     """Show this action only."""
+    step_table: Literal["observation", "reward", "termination"] | None = None
+    """Show this table instead of those of the factors: what decides each of its targets, and its rows."""
+    target: str | None = None
+    """Of --step-table, show the rows of this target, such as cell_2_3."""
     tree: bool = False
     """Print the tables of --factor as decision trees over the parents: only what was met, equal values together."""
     tolerance: float = 0.0
@@ -49,6 +53,12 @@ def run(options: Arguments) -> dict[str, Any]:
 
     dbn = TwoSliceDBN.load(folder.dbn)
     factor, action = selection(dbn, options.factor, options.action)
+    if options.target is not None and options.step_table is None:
+        raise UserError("--target: names a target of --step-table")
+    if options.step_table is not None:
+        from nesy.dbn.step_reading import describe_step_table
+
+        return {"table": describe_step_table(dbn, options.step_table, action, options.target)}
     if options.tree:
         return {"table": _trees(dbn, factor, action, options.tolerance)}
     parts = [describe(dbn, factor=factor, action=action)]

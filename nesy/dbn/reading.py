@@ -57,6 +57,8 @@ def _overview(dbn: TwoSliceDBN, actions: range | tuple[int, ...]) -> str:
                 f"  {dbn.factor_names[i]}' <- {', '.join(parents) or 'nothing'}"
                 f"   ({dbn.num_rows(a, i)} rows, {met} met)"
             )
+    if dbn.step_tables:
+        lines += ["", f"Further tables: {', '.join(dbn.step_tables)} (nesy show dbn --step-table NAME)"]
     return "\n".join(lines)
 
 

@@ -14,9 +14,11 @@ from nesy.dbn.graph import arc_strength
 from nesy.dbn.measures import row_differences, unknown_code_rate
 from nesy.dbn.model import TwoSliceDBN
 from nesy.dbn.rollouts import rollout_drift
+from nesy.dbn.step_reading import describe_step_table
 from nesy.dbn.trees import conditional_tree, describe_tree, look_up
 from nesy.errors import UserError
 from tests.nesy.dbn.models import all_codes, random_dbn
+from tests.nesy.dbn.steps import with_steps
 from tests.nesy.dbn.toy import experience, toy
 
 
@@ -36,6 +38,25 @@ def test_an_overview_and_wrong_names():
         describe(toy()[0], factor=3)
     with pytest.raises(UserError, match="swap, go"):
         describe(toy()[0], action=2)
+
+
+def test_step_tables_as_text():
+    rng = np.random.default_rng(0)
+    dbn = with_steps(random_dbn(rng), rng)
+    text = describe_step_table(dbn, "reward")
+    for a, action in enumerate(dbn.action_names):
+        parent = dbn.factor_names[dbn.step_tables["reward"].parents(a, 0)[0][1]]
+        assert f"{action}:\n  reward <- {parent}   (3 rows, 3 met)" in text
+    counts = dbn.step_tables["reward"].counts(0, 0)
+    value = dbn.step_tables["reward"].table(0, 0)[counts.argmax(), 0]
+    first = text.split("count\n")[1].splitlines()[0].split()
+    assert first == [str(counts.argmax()), str(counts.max()), f"{value:.4g}"]
+    assert describe_step_table(dbn, "observation", target="cell_0_1").count("wall:") == 3
+    assert "goes_on" in describe_step_table(dbn, "termination", action=1)
+    with pytest.raises(UserError, match="no target 'cell_9_9'; it has cell_0_0, cell_0_1"):
+        describe_step_table(dbn, "observation", target="cell_9_9")
+    with pytest.raises(UserError, match="no reward table; it has none"):
+        describe_step_table(random_dbn(rng), "reward")
 
 
 def test_the_graph_has_an_edge_per_parent():
