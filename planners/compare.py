@@ -19,7 +19,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from domains.core import Domain, load_domain
+from domains.core import Domain, DomainError, load_domain
 from nesy.errors import UserError
 from nesy.progress import SILENT, Progress
 from nesy.run_folder import RunFolder, atomic_path, read_json, write_json
@@ -29,6 +29,8 @@ from planners.evaluation import Columns, evaluate, outcome_names
 
 MINDS_VERSION = 1
 """Of what is learned where minds matter (planners.minds)."""
+OUT_OF_REACH = b"out of reach"
+"""Key of a cell's metadata: why an exact oracle cannot be had on its variant."""
 EVALUATION_SEED = 20_250_420
 """Seed of all evaluation episodes, whatever the seed of the run: results of different runs compare."""
 
@@ -136,11 +138,16 @@ def compare(
         run_cells([(cell, run.path, config, seed, domain_name) for cell in missing], jobs, task, engine, address)
     _report_influence_rules(run, config, domain, cells)
     tables = [pq.read_table(cell_path(run, cell), page_checksum_verification=True) for cell in cells]
+    left_out = {
+        f"{cell.agent} / {cell.variant}": table.schema.metadata[OUT_OF_REACH].decode()
+        for cell, table in zip(cells, tables, strict=True)
+        if OUT_OF_REACH in table.schema.metadata
+    }
     whole = pa.concat_tables(tables, promote_options="default").replace_schema_metadata(None)
     with atomic_path(run.results / "episodes.parquet") as temporary:
         pq.write_table(whole, temporary, compression="zstd")
     optima = {variant: map_optimum(run.results, domain, variant) for variant in config.variants}
-    return write_results(run.results, whole, config, optima)
+    return write_results(run.results, whole, config, optima, left_out)
 
 
 def _report_influence_rules(run: RunFolder, config: CompareConfig, domain: Domain, cells: list[Cell]) -> None:
@@ -228,22 +235,35 @@ def run_cell(
     progress: Progress = SILENT,
     advance: Callable[[int], None] = lambda count: None,
 ) -> None:
-    """Run one cell and write its episodes (and the trained policy, if it learns)."""
+    """Run one cell and write its episodes (and the trained policy, if it learns).
+
+    An exact oracle that is out of reach on its variant leaves no episodes, and the reason.
+    """
     from planners.cells import build_player
 
     run, domain = RunFolder(folder), load_domain(domain_name)
     fingerprint = _fingerprint(config, cell, seed)
     checkpoint = run.policies / f".{cell.name}-{fingerprint[:12]}.checkpoint.safetensors"
-    built = build_player(cell, run, domain, config, seed, progress, checkpoint)
     episodes = _episodes_evaluated(config, cell)
+    try:
+        built = build_player(cell, run, domain, config, seed, progress, checkpoint)
+    except DomainError as error:
+        if cell.agent not in settings.ORACLES:
+            raise
+        nothing = {"return": np.zeros(0), "length": np.zeros(0, np.int64), "outcome": np.zeros(0, np.int64)}
+        _write(run, cell, _table(cell, "eval", nothing), {"fingerprint": fingerprint, OUT_OF_REACH: str(error)})
+        return advance(episodes)
     results = evaluate(domain, cell.variant, built.player, episodes, EVALUATION_SEED + cell.seed, advance)
     results["experience_steps"] = np.full(episodes, built.experience_steps)
     tables = [_table(cell, "train", built.training)] if built.training is not None else []
     table = pa.concat_tables([*tables, _table(cell, "eval", results)], promote_options="default")
-    table = table.replace_schema_metadata({"fingerprint": fingerprint})
-    with atomic_path(cell_path(run, cell)) as temporary:
-        pq.write_table(table, temporary, compression="zstd", write_page_checksum=True)
+    _write(run, cell, table, {"fingerprint": fingerprint})
     checkpoint.unlink(missing_ok=True)
+
+
+def _write(run: RunFolder, cell: Cell, table: pa.Table, metadata: dict[Any, str]) -> None:
+    with atomic_path(cell_path(run, cell)) as temporary:
+        pq.write_table(table.replace_schema_metadata(metadata), temporary, compression="zstd", write_page_checksum=True)
 
 
 def cell_path(run: RunFolder, cell: Cell) -> Path:

@@ -42,9 +42,16 @@ MOST_POINTS = 400
 
 
 def write_results(
-    folder: Path, episodes: pa.Table, config: CompareConfig, optima: dict[str, Optimum | None]
+    folder: Path,
+    episodes: pa.Table,
+    config: CompareConfig,
+    optima: dict[str, Optimum | None],
+    left_out: dict[str, str] | None = None,
 ) -> list[dict[str, Any]]:
-    """Sum up and write every table; returns the `comparison` list of summary.json."""
+    """Sum up and write every table; returns the `comparison` list of summary.json.
+
+    `left_out` says what has no episodes, and why.
+    """
     from nesy.report.comparison_figures import save_figures
 
     played = _groups(episodes, "eval")
@@ -52,6 +59,7 @@ def write_results(
     regrets = [row for condition, rows in played.items() for row in _regrets(condition, rows, optima)]
     statistics = {
         "confidence": config.confidence,
+        "left_out": left_out or {},
         "profiles": _profiles(played),
         "improvement": _improvements(played, config),
         "curves": [_curve(condition, rows, config) for condition, rows in _groups(episodes, "train").items()],

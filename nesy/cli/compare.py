@@ -32,13 +32,16 @@ def run(options: Arguments) -> dict[str, Any]:
     """Run the cells of the grid that the run folder does not hold yet."""
     with pipeline.opened(options, "compare", compare=options.settings) as steps:
         result = steps.compare(options.engine, options.address)
+        result["left_out"] = read_json(steps.run.results / "statistics.json")["left_out"]
         path = steps.run.results / "influence_rules.json"
         return result | ({"influence_rules": read_json(path)} if path.is_file() else {})
 
 
 def show(result: dict[str, Any]) -> None:
-    """Print the comparison table, and what rules about the person changed."""
+    """Print the comparison table, what was left out, and what rules about the person changed."""
     tables.print_comparison(result["comparison"])
+    for name, reason in result["left_out"].items():
+        print(f"{name} left out: {reason}")
     for variant, change in result.get("influence_rules", {}).items():
         if change is not None:
             share = f"{change['constrained']} of {change['codes']} known codes"

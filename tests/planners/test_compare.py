@@ -8,7 +8,7 @@ import pytest
 
 from domains.core import load_domain
 from nesy.errors import UserError
-from nesy.run_folder import RunFolder
+from nesy.run_folder import RunFolder, read_json
 from planners.baselines import LastSeenFollower, OracleFollower
 from planners.compare import EVALUATION_SEED, compare, grid
 from planners.config import CompareConfig
@@ -132,3 +132,13 @@ def test_every_metric_is_a_column_and_every_table_is_written(tmp_path: Path, mon
     for name in ("returns", "profiles"):
         assert (run.results / "plots" / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
         assert "<svg" in (run.results / "plots" / f"{name}.svg").read_text()
+
+
+def test_an_oracle_out_of_reach_is_left_out_with_its_reason(tmp_path: Path) -> None:
+    run = RunFolder(tmp_path)
+    config = CompareConfig(agents=("greedy-follower", "optimum"), variants=("occluded",), episodes=2)
+    (record,) = compare(run, config)
+    assert record["agent"] == "greedy-follower"
+    (reason,) = read_json(run.results / "statistics.json")["left_out"].items()
+    assert reason[0] == "optimum / occluded"
+    assert "too many for an exact optimum" in reason[1]
