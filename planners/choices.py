@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from domains.core import Domain
 from nesy.errors import UserError
@@ -59,21 +61,37 @@ class Choice:
         return "\n".join(lines)
 
 
-def find_cell(config: CompareConfig, name: str) -> Cell:
-    """The cell of a comparison that a name, or the beginning of one, means.
+def find_cell(run: RunFolder, config: CompareConfig, name: str) -> Cell:
+    """The cell of a run that a name, or the beginning of one, means.
+
+    Looked for among the cells of the comparison that the run is configured for, and those that it holds results of.
 
     Raises:
-        UserError: there is none that acts on percepts, or several.
+        UserError: there is none that acts on percepts.
     """
-    cells = [cell for cell in grid(config) if cell.agent in ("dqn", "pomdp", "search")]
+    cells = [cell for cell in (*grid(config), *_cells_with_results(run)) if cell.agent in ("dqn", "pomdp", "search")]
     exact = [cell for cell in cells if cell.name == name]
     found = exact or [cell for cell in cells if cell.name.startswith(name)]
     # of several that differ in the influence mode only, the one that perceives minds
     usual = [cell for cell in found if cell.influence == "perspective-shift"]
     chosen = usual if len(found) > 1 and usual else found
     if not chosen:
-        raise UserError(f"no agent '{name}' with values of its own; there are {', '.join(c.name for c in cells)}")
+        there = ", ".join(sorted({cell.name for cell in cells})) or "none (nesy compare makes some)"
+        raise UserError(f"no agent '{name}' with values of its own; there are {there}")
     return chosen[0]
+
+
+def _cells_with_results(run: RunFolder) -> list[Cell]:
+    """The cells of this and earlier comparisons that results/cells/ holds."""
+    keys = ["agent", "inputs", "influence", "variant", "seed"]
+    found = []
+    for path in sorted((run.results / "cells").glob("*.parquet")):
+        try:
+            rows = pq.read_table(path, columns=keys).slice(0, 1).to_pylist()
+        except (OSError, pa.ArrowException):
+            continue  # cut off: the next comparison makes it anew
+        found += [Cell(**row) for row in rows if all(row[key] is not None for key in keys)]
+    return found
 
 
 def explain_choice(

@@ -86,7 +86,7 @@ def _command(line: str, folder: Path) -> None:
 @contextlib.contextmanager
 def _rules_here() -> Iterator[None]:
     """A folder with the document's rules.lp, to work in."""
-    (rules,) = (text for language, _, text in BLOCK.findall(DOCUMENT.read_text("utf-8")) if language == "rules")
+    rules = "".join(text for language, _, text in BLOCK.findall(DOCUMENT.read_text("utf-8")) if language == "rules")
     before = Path.cwd()
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "rules.lp").write_text(rules, encoding="utf-8")

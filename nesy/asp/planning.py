@@ -325,11 +325,11 @@ def _goal_probability(
     """The probability of the goal after a plan (at least), and the mass of the outcomes left out."""
     about_factors = all(literal.factor >= 0 for literal in literals)
     factors = sorted({literal.factor for literal in literals}) if about_factors else None
-    codes, weights, _ = _outcomes_of(dbn, start, plan, factors)
+    codes, weights, _ = outcomes_of(dbn, start, plan, factors)
     return float(weights[satisfied(literals, codes, truth)].sum()), max(0.0, 1.0 - float(weights.sum()))
 
 
-def _outcomes_of(
+def outcomes_of(
     dbn: TwoSliceDBN, start: np.ndarray, plan: Sequence[int], factors: Sequence[int] | None = None
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Codes that a plan leads to, their exact probabilities, and up to which probability branches were cut.
@@ -344,48 +344,3 @@ def _outcomes_of(
             if drop == CUTS[-1]:
                 raise
     raise AssertionError
-
-
-@dataclass(frozen=True)
-class Aftermath:
-    """What holds after a plan."""
-
-    must: tuple[str, ...]
-    """Predicates that hold in every possible outcome."""
-    cannot: tuple[str, ...]
-    """Predicates that hold in none."""
-    can: dict[str, float]
-    """The others, with their probability (outcomes whose code leaves a predicate open do not count for it)."""
-    codes: int
-    """Number of possible outcomes."""
-    unknown: float
-    """Probability of outcomes that are no code met in experience: nothing is known about their predicates."""
-    cut: float
-    """Outcomes that are at most so probable were left out."""
-    dropped: float
-    """Their probability together."""
-
-
-def after(dbn: TwoSliceDBN, truth: PredicateTruth, start: np.ndarray, plan: Sequence[int]) -> Aftermath:
-    """What must, can and cannot hold after a plan.
-
-    Outcomes whose probability is at most one in a million are left out; where too many others are left, those of at
-    most one in 100,000, and so on. The result says which, and how probable they are together.
-
-    Raises:
-        UserError: more than 50,000 outcomes have a probability above 0.001.
-    """
-    codes, weights, cut = _outcomes_of(dbn, start, plan)
-    holds, fails = truth.of(codes)
-    known = (holds | fails).any(axis=1)
-    probability = weights @ holds
-    must, cannot, can = [], [], {}
-    for p, name in enumerate(truth.codebook.predicate_names):
-        if holds[:, p].all():
-            must.append(name)
-        elif fails[:, p].all():
-            cannot.append(name)
-        else:
-            can[name] = float(probability[p])
-    dropped = max(0.0, 1.0 - float(weights.sum()))
-    return Aftermath(tuple(must), tuple(cannot), can, len(codes), float(weights[~known].sum()), cut, dropped)

@@ -125,24 +125,34 @@ class StepQuestions(Subject):
             edges.append((here, there, f"{action} ({explanation.probability:.3g})"))
         return edges
 
-    def after(self, start: Sequence[int], plan: Sequence[int | str]) -> Finding:
+    def after(self, start: Sequence[int], plan: Sequence[int | str], least: float = LEAST) -> Finding:
         """What must, can and cannot hold after a plan?
+
+        Args:
+            start: the code to start from.
+            plan: numbers or names of the actions.
+            least: outcomes less probable than this are left out; how much that is together is stated.
 
         Raises:
             UserError: a wrong code or action.
         """
-        from nesy.asp.planning import after
+        from nesy.asp.aftermath import after
+        from nesy.asp.semantics import ordered
 
         started = time.perf_counter()
         actions = [self.action(a) for a in plan]
-        found = after(self.dbn, self._truth(), np.asarray(start), actions)
+        found = after(self.dbn, self._truth(), np.asarray(start), actions, least)
         likely = sorted(found.can.items(), key=lambda item: -item[1])[:MOST_LINES]
+        # names of their own first: what cells cannot be is a long list
+        excluded = ordered(found.cannot)
+        more = f" and {len(excluded) - MOST_LINES} more" if len(excluded) > MOST_LINES else ""
+        cannot = ", ".join(excluded[:MOST_LINES]) + more or "nothing"
         text = (
             f"{found.codes} outcomes are possible "
-            f"(those of at most {found.cut:g} are left out, together {found.dropped:.2g}).\n"
+            f"(those less probable than {found.cut:g} are left out, together {found.dropped:.2g}).\n"
             f"  must hold: {', '.join(found.must) or 'nothing'}\n"
             f"  can hold: {', '.join(f'{name} ({p:.3f})' for name, p in likely) or 'nothing else'}\n"
-            f"  cannot hold: {len(found.cannot)} predicates"
+            f"  cannot hold: {cannot}"
         )
         names = ", ".join(self.dbn.action_names[a] for a in actions)
         source = f"{' '.join(str(int(v)) for v in start)}; {names}"

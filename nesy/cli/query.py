@@ -63,7 +63,7 @@ class Arguments:
     codes: Literal["all", "met"] = "all"
     """Whether a property is to hold for all codes, or for those met in experience."""
     least: float = 0.001
-    """For properties, values of a row less probable than this count as impossible."""
+    """For properties, values of a row less probable than this count as impossible; for --after, outcomes."""
     plan: str | None = None
     """Conditions of a goal: the shortest plan of most probable outcomes to it from --start."""
     trajectory: str | None = None

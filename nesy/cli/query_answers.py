@@ -40,7 +40,7 @@ def _reach(knowledge: KnowledgeBase, options: Arguments) -> dict[str, Any]:
 
 
 def _after(knowledge: KnowledgeBase, options: Arguments) -> dict[str, Any]:
-    return knowledge.after(_start(knowledge, options.start), options.after).to_dict()
+    return knowledge.after(_start(knowledge, options.start), options.after, options.least).to_dict()
 
 
 def _explain(knowledge: KnowledgeBase, options: Arguments) -> dict[str, Any]:
@@ -121,7 +121,7 @@ def _why(knowledge: KnowledgeBase, options: Arguments) -> dict[str, Any]:
         run,
         domain,
         config.compare,
-        find_cell(config.compare, options.why or ""),
+        find_cell(run, config.compare, options.why or ""),
         book.views[having[0]],
         place,
         config.seed,

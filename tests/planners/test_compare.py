@@ -10,6 +10,7 @@ from domains.core import load_domain
 from nesy.errors import UserError
 from nesy.run_folder import RunFolder, read_json
 from planners.baselines import LastSeenFollower, OracleFollower
+from planners.choices import find_cell
 from planners.compare import EVALUATION_SEED, compare, grid
 from planners.config import CompareConfig
 from planners.evaluation import Player, evaluate
@@ -142,3 +143,13 @@ def test_an_oracle_out_of_reach_is_left_out_with_its_reason(tmp_path: Path) -> N
     (reason,) = read_json(run.results / "statistics.json")["left_out"].items()
     assert reason[0] == "optimum / occluded"
     assert "too many for an exact optimum" in reason[1]
+
+
+def test_agents_of_earlier_comparisons_can_be_asked_too(tiny_run: Path) -> None:
+    run, later = RunFolder(tiny_run), CompareConfig(agents=("random",))
+    assert find_cell(run, later, "dqn").influence == "perspective-shift"
+    assert find_cell(run, later, "search-full-random").name == "search-full-random-paper-seed0"
+    with pytest.raises(UserError, match="no agent 'greedy' with values of its own; there are dqn-full-"):
+        find_cell(run, later, "greedy")
+    with pytest.raises(UserError, match="there are none"):
+        find_cell(RunFolder(tiny_run / "nowhere"), later, "dqn")

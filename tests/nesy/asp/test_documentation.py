@@ -31,7 +31,7 @@ def test_the_ten_questions_and_everything_else(base, capsys, tmp_path):
     script = runpy.run_path(str(ROOT / "scripts" / "worked_questions.py"))
     count = script["work_through"](folder)
     text = capsys.readouterr().out
-    assert count == 28
+    assert count == 29
     assert "wall_ahead holds in" in text and "'forward' changes" in text
     assert "# left out, needs compare: nesy query --run runs/demo --why" in text
     assert len(re.findall(r"^\*\*\d+\. ", TEXT, re.MULTILINE)) == 10

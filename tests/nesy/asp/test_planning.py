@@ -1,12 +1,15 @@
 """Plans against breadth-first search, beliefs against their definition, what holds after a plan."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nesy.asp import KnowledgeBase
-from nesy.asp.planning import PredicateTruth, after, find_plan
+from nesy.asp.aftermath import after
+from nesy.asp.planning import PredicateTruth, find_plan
 from nesy.errors import UserError
 from tests.nesy.dbn.models import all_codes, random_dbn, transition_matrix
 from tests.nesy.dbn.toy import toy
@@ -119,6 +122,21 @@ def test_what_holds_after_a_plan():
     assert result.codes == 1 and result.unknown == 0
     # a value that no view has: nothing is known
     assert after(dbn, PredicateTruth(codebook), np.array([0, 0, 2]), [0]).unknown == 1
+
+
+@pytest.mark.parametrize("least", [0.0, 1e-3, 0.2, 0.9])
+def test_improbable_outcomes_are_left_out_and_that_is_said(least):
+    dbn, codebook = toy()
+    table = 0.7 * dbn.probabilities + 0.1
+    noisy = replace(dbn, probabilities=table / table.sum(axis=1, keepdims=True))
+    result = after(noisy, PredicateTruth(codebook), np.array([1, 0, 1]), [0], least)
+    codes = np.array(list(np.ndindex(3, 3, 3)))
+    chances = np.exp(noisy.log_prob(np.array([1, 0, 1]), 0, codes))
+    kept = chances >= least if (chances >= least).any() else chances == chances.max()
+    assert result.codes == kept.sum() and result.dropped == pytest.approx(1 - chances[kept].sum())
+    holds, fails = PredicateTruth(codebook).of(codes[kept])
+    assert result.must == tuple(n for n, all_ in zip(codebook.predicate_names, holds.all(0), strict=True) if all_)
+    assert result.cannot == tuple(n for n, all_ in zip(codebook.predicate_names, fails.all(0), strict=True) if all_)
 
 
 def test_knowledge_is_what_all_particles_agree_on():
