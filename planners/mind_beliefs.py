@@ -156,7 +156,7 @@ class MindBelief:
         faced = int(scenes.follows[s, q, FORWARD])
         wall = int(action == FORWARD and faced == q)
         person = int(faced != q and scenes.cell[s, faced] == scenes.cell[s, node[PLACE]])
-        moved = float(self.model.moved_chance[min(node[CLOCK], self.model.max_steps), action, wall, person])
+        moved = float(self.model.moved_chance[min(node[CLOCK], self.model.horizon), action, wall, person])
         return [(int(scenes.follows[s, q, action]), moved), (q, 1.0 - moved)]
 
     def _see(self, code: np.ndarray, pose: np.ndarray | None) -> float:

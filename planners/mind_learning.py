@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from nesy.experience import Experience
 
 _MOST_EXPLORING = 120_000
+HORIZON = 64
+"""Steps for which persons' ways are imagined, at least: logged episodes that are lost early say little of the last."""
 
 
 def several_goals(experience: Experience) -> bool:
@@ -80,7 +82,15 @@ def learn_minds(codec: Codec, experience: Experience, provenance: dict[str, Any]
     plain = (following.view != GOAL).all((1, 2)) & (scenes.view[scene, robot] != GOAL).all((1, 2))
     noise = float((expected != codec.codes(following.view))[plain].mean()) if plain.any() else 0.0
     return MindModel(
-        scenes, intentions, moves, next_lost, outcome, reward, noise, int(t.max()) + 1, dict(provenance or {})
+        scenes,
+        intentions,
+        moves,
+        next_lost,
+        outcome,
+        reward,
+        noise,
+        max(HORIZON, int(t.max()) + 1),
+        dict(provenance or {}),
     )
 
 

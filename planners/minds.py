@@ -66,7 +66,7 @@ class MindModel:
         outcome, reward: given `STEP`.
         displacement: int64 [motions, 3], see `planners.scenes.Frame`.
         code_noise: how often a factor of the robot's code is not that of what the scene shows.
-        max_steps: steps of the longest logged episode.
+        horizon: for how many steps persons' ways are imagined.
         provenance: where the tables come from.
     """
 
@@ -77,7 +77,7 @@ class MindModel:
     outcome: DecisionTable
     reward: DecisionTable
     code_noise: float
-    max_steps: int
+    horizon: int
     provenance: dict[str, Any]
 
     @property
@@ -105,7 +105,7 @@ class MindModel:
     @cached_property
     def moved_chance(self) -> np.ndarray:
         """P(moved | t, action, wall ahead, person ahead): float64 [T, A, 2, 2]."""
-        shape = (self.max_steps + 1, 4, 2, 2)
+        shape = (self.horizon + 1, 4, 2, 2)
         t, action, wall, person = (part.ravel() for part in np.indices(shape))
         variables = move_variables(t, action, wall, person)
         return np.asarray(self.moved.estimates()[self.moved.locate(variables)][:, 1].reshape(shape))
@@ -146,7 +146,7 @@ class MindModel:
         description = {
             "format": "nesy-minds",
             "code_noise": self.code_noise,
-            "max_steps": self.max_steps,
+            "horizon": self.horizon,
             "tables": {
                 name: {"kind": table.kind, "names": {str(s): text for s, text in table.names.items()}}
                 for name, table in self._tables().items()
@@ -186,7 +186,7 @@ class MindModel:
                 table("outcome"),
                 table("reward"),
                 float(description["code_noise"]),
-                int(description["max_steps"]),
+                int(description["horizon"]),
                 dict(description["provenance"]),
             )
         except (OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, zipfile.BadZipFile, zlib.error):

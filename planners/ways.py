@@ -146,7 +146,7 @@ class Ways:
             self._of[here] = len(self._of)
             order.append(here)
             self._after.append([])
-            if here[CLOCK] >= self.model.max_steps or here[STANDING] >= MAX_STANDING:
+            if here[CLOCK] >= self.model.horizon or here[STANDING] >= MAX_STANDING:
                 continue
             likely = sorted(((c, after) for after, c in self.successors(here).items() if c >= _RARE), reverse=True)
             total = sum(c for c, _ in likely[:_MOST])

@@ -68,22 +68,29 @@ class CommonArguments:
 def base_config(arguments: list[str]) -> RunConfig:
     """The configuration that the options on the command line then change.
 
-    That is the run's own, or the preset's when one is named or the run is new. It has to be known before the
-    other options are parsed, so that their help shows the values that would really be used.
+    That is the run's own, or the preset's when one is named or the run is new; with another variant, that is what is
+    compared. It has to be known before the other options are parsed, so that their help shows the values that would
+    really be used.
     """
     run, preset = Path(_option(arguments, "--run") or CommonArguments.run), _option(arguments, "--preset")
     if preset in PRESETS:
-        return PRESETS[preset]
-    if (run / "config.json").is_file():
-        return configuration.load(run / "config.json")
-    return PRESETS["quick"]
+        config = PRESETS[preset]
+    elif (run / "config.json").is_file():
+        config = configuration.load(run / "config.json")
+    else:
+        config = PRESETS["quick"]
+    variant = _option(arguments, "--variant") or config.variant
+    if variant == config.variant:
+        return config
+    return replace(config, variant=variant, compare=replace(config.compare, variants=(variant,)))
 
 
 def config_of(options: CommonArguments) -> RunConfig:
     """The configuration that parsed options refer to: see `base_config`."""
     arguments = ["--run", str(options.run)]
-    if options.preset is not None:
-        arguments += ["--preset", options.preset]
+    for name, value in (("--preset", options.preset), ("--variant", options.variant)):
+        if value is not None:
+            arguments += [name, value]
     return base_config(arguments)
 
 
