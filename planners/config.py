@@ -156,7 +156,7 @@ class SearchConfig:
 class CompareConfig:
     """What is compared: the grid of agents x input sets x influence modes x variants x seeds."""
 
-    agents: tuple[str, ...] = tuple(agent for agent in AGENTS[:-2] if agent != "qmdp")
+    agents: tuple[str, ...] = tuple(agent for agent in AGENTS[:-1] if agent != "qmdp")
     """Which agents: dqn, pomdp (pomdp-py), search, qmdp, greedy-follower, greedy-last-seen, random, and the exact
     oracles optimum (full state), bayes-optimum and egocentric-optimum (where the task is small enough)."""
     inputs: tuple[str, ...] = ("full",)
