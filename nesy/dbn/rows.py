@@ -35,18 +35,27 @@ def unique_rows(table: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return _counted(keys)
 
 
-def _counted(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """As `unique_rows`, of numbers: hashed, not sorted, since millions of rows hold few distinct ones."""
+def distinct_values(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distinct numbers [D], ascending, and which one each of n is, int64 [n].
+
+    Hashed, not sorted, since millions of numbers hold few distinct ones.
+    """
     import pyarrow as pa
 
-    coded = pa.array(keys).dictionary_encode()
-    order = np.argsort(coded.dictionary.to_numpy())
+    coded = pa.array(values).dictionary_encode()
+    distinct = coded.dictionary.to_numpy()
+    order = np.argsort(distinct)
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
-    index = rank[coded.indices.to_numpy()]
-    first = np.empty(len(order), dtype=np.int64)
+    return distinct[order], rank[coded.indices.to_numpy()]
+
+
+def _counted(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """As `unique_rows`, of numbers."""
+    distinct, index = distinct_values(keys)
+    first = np.empty(len(distinct), dtype=np.int64)
     first[index[::-1]] = np.arange(len(index) - 1, -1, -1)
-    return first, index, np.bincount(index, minlength=len(order))
+    return first, index, np.bincount(index, minlength=len(distinct))
 
 
 def _sorted(table: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

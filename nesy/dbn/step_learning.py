@@ -9,8 +9,9 @@ import numpy as np
 
 from nesy.dbn.codebook import Codebook
 from nesy.dbn.model import TwoSliceDBN
+from nesy.dbn.rows import distinct_values
 from nesy.dbn.step_tables import Parents, StepTable
-from nesy.dbn.structure import Search, learn_parents
+from nesy.dbn.structure import Candidates, Search, learn_parents
 
 OBSERVATION = Search(max_parents=4, exhaustive=2)
 STEPS = Search(max_parents=4, max_next=1, exhaustive=1)
@@ -27,9 +28,10 @@ def with_observation(dbn: TwoSliceDBN, codebook: Codebook, search: Search = OBSE
     weights = np.maximum(codebook.counts, 1).astype(np.float64)
     n, k = codebook.codes.shape[1], dbn.num_values
     parents, rows, counts = [], [], []
+    candidates = Candidates(codebook.codes)
     for cell in flat.T:
         child = np.eye(kinds)[cell]
-        chosen = learn_parents(codebook.codes, child, weights, k, (n, n), search)
+        chosen = learn_parents(candidates, child, weights, k, (n, n), search)
         parents.append(chosen)
         table, met = _rows(codebook.codes[:, list(chosen)], weights[:, None] * child, k)
         rows.append((table + PRIOR * table.sum(axis=0) / table.sum()) / (met + PRIOR)[:, None])
@@ -81,16 +83,16 @@ def with_outcomes(
 
 def _levels(rewards: np.ndarray) -> tuple[np.ndarray, int]:
     """Every reward as one of a few levels, and how many there are: its own value, or a bin of equal shares."""
-    distinct, index = np.unique(rewards, return_inverse=True)
+    distinct, index = distinct_values(rewards)
     if len(distinct) > LEVELS:
-        counts = np.bincount(index.reshape(-1)).astype(float)
+        counts = np.bincount(index).astype(float)
         common = int(counts.argmax())
         counts[common] = 0.0
         share = np.cumsum(counts) / counts.sum()
         bins = np.minimum((share * (LEVELS - 1)).astype(np.int64), LEVELS - 2)
         bins[common] = LEVELS - 1
-        return bins[index.reshape(-1)], LEVELS
-    return index.reshape(-1), len(distinct)
+        return bins[index], LEVELS
+    return index, len(distinct)
 
 
 def _histogram(kind: np.ndarray, outcome: np.ndarray, size: int, number: int) -> np.ndarray:

@@ -42,8 +42,32 @@ class Search:
     """Parent sets from slice t up to this size are all tried; larger ones grow parent by parent."""
 
 
+class Candidates:
+    """Values of possible parents; children that share them share what is computed of them alone."""
+
+    def __init__(self, values: np.ndarray) -> None:
+        """Merge equal combinations, so that every score works on few rows.
+
+        Args:
+            values: uint8 [n, C].
+        """
+        first, self.index, _ = unique_rows(values)
+        self.merged = values[first].astype(np.int64)
+        self._groups: dict[tuple[int, ...], np.ndarray] = {}
+
+    def groups(self, chosen: tuple[int, ...]) -> np.ndarray:
+        """Which of the distinct values of some columns each merged combination has: int64 [m]."""
+        if chosen not in self._groups:
+            size = int(self.merged.max(initial=0)) + 1
+            row = np.zeros(len(self.merged), dtype=np.int64)
+            for column in chosen:
+                row = row * size + self.merged[:, column]
+            self._groups[chosen] = np.unique(row, return_inverse=True)[1].reshape(-1)
+        return self._groups[chosen]
+
+
 def learn_parents(
-    candidates: np.ndarray,
+    candidates: np.ndarray | Candidates,
     child: np.ndarray,
     weights: np.ndarray,
     num_values: int,
@@ -53,7 +77,7 @@ def learn_parents(
     """The best parents of one factor under one action.
 
     Args:
-        candidates: integers [n, C]: values of the possible parents.
+        candidates: integers [n, C]: values of the possible parents, or what was made of them for several children.
         child: float [n, M]: distribution of the child in every transition (one-hot where it was observed).
         weights: float [n]: how much each transition counts.
         num_values: K, values that a candidate may have.
@@ -70,12 +94,12 @@ def learn_parents(
         raise UserError(f"no score '{search.score}'; the scores are {', '.join(SCORES)}")
     split, total = limits
     known: dict[tuple[int, ...], float] = {}
-    # equal combinations of candidates are merged once, so that every score works on few rows
-    first, index, _ = unique_rows(candidates)
-    merged = candidates[first]
+    shared = candidates if isinstance(candidates, Candidates) else Candidates(candidates)
+    number = len(shared.merged)
     counts = np.stack(
-        [np.bincount(index, weights * child[:, k], minlength=len(merged)) for k in range(child.shape[1])], axis=1
+        [np.bincount(shared.index, weights * column, minlength=number) for column in child.T if column.any()], axis=1
     )
+    size = child.shape[1]
 
     def allowed(chosen: tuple[int, ...]) -> bool:
         later = sum(c >= split for c in chosen)
@@ -83,7 +107,8 @@ def learn_parents(
 
     def score(chosen: tuple[int, ...]) -> float:
         if chosen not in known:
-            known[chosen] = _score(merged[:, list(chosen)], counts, num_values, search)
+            rows = float(num_values) ** len(chosen)
+            known[chosen] = _score(shared.groups(chosen), counts, size, rows, search)
         return known[chosen]
 
     depth = min(search.exhaustive, search.max_parents)
@@ -110,24 +135,26 @@ def _climb(
         best = better
 
 
-def _score(values: np.ndarray, counts: np.ndarray, num_values: int, search: Search) -> float:
+def _score(index: np.ndarray, counts: np.ndarray, size: int, q: float, search: Search) -> float:
+    """The score of one parent set.
+
+    Args:
+        index: int64 [m]: the row that each combination of candidates belongs to.
+        counts: float [m, M]: counts of the child's values; values that it never has can be left out.
+        size: how many values the child has, those left out included.
+        q: rows of the table.
+        search: what is scored.
+    """
     from scipy.special import gammaln
 
-    arity = values.shape[1]
-    q = float(num_values) ** arity
-    row = np.zeros(len(values), dtype=np.int64)
-    for column in range(arity):
-        row = row * num_values + values[:, column]
-    _, index = np.unique(row, return_inverse=True)
-    index = index.reshape(-1)
-    size = counts.shape[1]
-    table = np.stack([np.bincount(index, counts[:, k]) for k in range(size)], axis=1)
+    table = np.stack([np.bincount(index, column) for column in counts.T], axis=1)
     totals = table.sum(axis=1)
     if search.score == "bdeu":
         per_row, per_entry = search.sample_size / q, search.sample_size / (q * size)
         rows = gammaln(per_row) - gammaln(per_row + totals)
-        entries = gammaln(per_entry + table) - gammaln(per_entry)
-        return float(rows.sum() + entries.sum())
+        # an entry without counts adds nothing
+        met = table[table > 0]
+        return float(rows.sum() + gammaln(per_entry + met).sum() - len(met) * gammaln(per_entry))
     with np.errstate(divide="ignore", invalid="ignore"):
         likelihood = float(np.where(table > 0, table * np.log(table / totals[:, None]), 0.0).sum())
     free = q * (size - 1)
