@@ -11,8 +11,8 @@ from nesy.errors import UserError
 from planners.ialm import TIMEOUT, WAIT, Codec
 from planners.intentions import learn_intentions
 from planners.minds import MAX_STANDING, MAX_WALK, MOVES, STEP, MindModel, move_variables
-from planners.motion import FORWARD, STAY, learn_motion
-from planners.scenes import Frame, Scenes, frame_of, learn_scenes, reckon
+from planners.motion import FORWARD, STAY
+from planners.scenes import Frame, Scenes, learn_frame, learn_scenes, reckon
 from planners.tables import DecisionTable, Parents, learn_distribution, learn_mean
 
 if TYPE_CHECKING:
@@ -40,8 +40,7 @@ def learn_minds(codec: Codec, experience: Experience, provenance: dict[str, Any]
     following = _whole(experience.select(np.char.startswith(experience.source, "following")))
     if len(following) == 0:
         raise UserError("the experience holds no person-following episodes; collect some (sources following-*)")
-    motion, moved = learn_motion(following)
-    frame = frame_of(motion)
+    frame, moved = learn_frame(following)
     t = following.t.astype(np.int64) - int(following.t.min())
     poses = reckon(frame, following, moved)
     people = frame.compose(poses, following.relative_pose.astype(np.int64))

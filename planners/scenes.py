@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from domains.core import GOAL, UNSEEN, WALL
+from domains.core import GOAL, LEFT, RIGHT, UNSEEN, WALL
 from nesy.compiled import njit
-from planners.motion import FORWARD, NUM_HEADINGS, NUM_MOTIONS, STAY, RelativeMotion
+from nesy.errors import UserError
+from planners.motion import FORWARD, NUM_HEADINGS, NUM_MOTIONS, NUM_MOVES, STAY
 
 if TYPE_CHECKING:
     from nesy.experience import Experience
@@ -52,24 +53,62 @@ class Frame:
         return np.concatenate([place, turned[..., None]], axis=-1)
 
 
-def frame_of(motion: RelativeMotion) -> Frame:
-    """Read the frame off the learned motions of c."""
-    ahead = motion.coefficients[STAY, FORWARD, :, :, 2]
-    right = motion.next_heading[STAY, 1]
-    side = ahead[right]
+def learn_frame(experience: Experience) -> tuple[Frame, np.ndarray]:
+    """Read the frame off how the person's relative pose changes.
+
+    A robot that stays sees the person's own step; whatever action changes no more than that did not move the robot.
+    A person that turns where it stands shows the robot's motion.
+
+    Args:
+        experience: person-following transitions.
+
+    Returns:
+        The frame, and bool [n]: whether the action moved the robot (true for every `stay`).
+
+    Raises:
+        UserError: some step was never seen.
+    """
+    before, after = experience.relative_pose.astype(np.int64), experience.next_relative_pose.astype(np.int64)
+    action, move = experience.action.astype(np.int64), experience.person_action.astype(np.int64)
+    change = after - before
+    turned = change[:, 2] % NUM_HEADINGS
+    still = action == STAY
+    turns = np.array([_usual(turned[still & (move == u)], 0) for u in range(NUM_MOVES)])
+    ahead = np.array(
+        [
+            [_usual(change[still & (move == FORWARD) & (before[:, 2] == h), axis]) for axis in range(2)]
+            for h in range(NUM_HEADINGS)
+        ]
+    )
+    own = np.where((move == FORWARD)[:, None], ahead[before[:, 2]], 0)
+    moved = still | (change[:, :2] != own).any(1) | (turned != turns[move])
+    effective = np.where(moved, action, STAY)
     displacement = np.zeros((NUM_MOTIONS, 3), np.int64)
-    displacement[:, 2] = AHEAD
-    for m in range(NUM_MOTIONS):
-        # a person that turns where it stands: what changes besides its heading is the robot's doing
-        examples = motion.counts[m, :2, :, 0]
-        if m == STAY or not examples.any():
-            continue
-        u, h = np.unravel_index(examples.argmax(), examples.shape)
-        a = motion.coefficients[m, u, h]
+    displacement[STAY, 2] = AHEAD
+    for m in (LEFT, RIGHT, FORWARD):
+        rows = (effective == m) & (move != FORWARD)
+        places = np.concatenate([before[rows, :2], np.ones((rows.sum(), 1), np.int64)], axis=1)
+        if not rows.any() or np.linalg.matrix_rank(places) < 3:
+            raise UserError("the experience shows too few steps of robot and person; collect more episodes")
+        a = np.rint(np.linalg.lstsq(places, after[rows, :2], rcond=None)[0].T)
         displacement[m, :2] = np.rint(-np.linalg.solve(a[:, :2], a[:, 2]))
-        turned = motion.next_heading[m, u, h] - motion.next_heading[STAY, u, h]
-        displacement[m, 2] = (AHEAD - turned) % NUM_HEADINGS
-    return Frame(ahead, side, displacement)
+        displacement[m, 2] = (AHEAD - _usual((turned - turns[move])[rows] % NUM_HEADINGS)) % NUM_HEADINGS
+    right = (np.arange(NUM_HEADINGS) + turns[RIGHT]) % NUM_HEADINGS
+    return Frame(ahead, ahead[right], displacement), moved
+
+
+def _usual(values: np.ndarray, otherwise: int | None = None) -> int:
+    """The most frequent of some whole numbers.
+
+    Raises:
+        UserError: there are none, and nothing is given to take otherwise.
+    """
+    if len(values) == 0:
+        if otherwise is not None:
+            return otherwise
+        raise UserError("the experience shows too few steps of the person; collect more episodes")
+    found, counts = np.unique(values, return_counts=True)
+    return int(found[counts.argmax()])
 
 
 def reckon(frame: Frame, experience: Experience, moved: np.ndarray) -> np.ndarray:

@@ -1,0 +1,410 @@
+"""What is learned where minds matter: scenes, intentions, beliefs over them, and values of imagined ways."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from domains.core import GOAL, UNSEEN, WALL, load_domain
+from nesy.collection import collect, collect_following
+from nesy.config import CollectConfig
+from nesy.errors import UserError
+from nesy.experience import Experience
+from planners.config import SearchConfig
+from planners.ialm_learning import joined
+from planners.mind_agent import MindSearch
+from planners.mind_beliefs import MindBelief
+from planners.mind_learning import learn_minds, several_goals
+from planners.mind_walk import MindTree, mind_advance
+from planners.minds import MAX_WALK, MindModel
+from planners.motion import FORWARD, STAY
+from planners.random_bits import stream
+from planners.scenes import FAR, learn_frame
+from planners.ways import CLOCK, GONE, HEADS_FOR, OWN, PLACE, SCENE, Node, Ways
+
+MAPS = 6
+
+
+class DigitCodec:
+    """A code is what a checksum of the view says: enough to tell views apart."""
+
+    num_values = 8
+
+    def codes(self, views: np.ndarray) -> np.ndarray:
+        flat = views.reshape(len(views), -1).astype(np.uint64)
+        sums = (flat * (np.arange(flat.shape[1], dtype=np.uint64) * np.uint64(2654435761) + np.uint64(97))).sum(1)
+        return (sums[:, None] >> np.arange(0, 32, 4, dtype=np.uint64) & np.uint64(7)).astype(np.uint8)
+
+
+CODEC: Any = DigitCodec()
+
+
+def experience_of(variant: str, folder: Path) -> Experience:
+    """A few hundred episodes on some maps."""
+    domain = load_domain("person_following")
+    config = CollectConfig(crossing_episodes=0, following_episodes=240)
+    collect(domain, config, folder / "walks", 3, variant=variant)
+    collect_following(domain, 3000, 0.3, folder / "practice", 3, variant=variant)
+    experience = joined(Experience.load(folder / "walks"), Experience.load(folder / "practice"))
+    maps = np.unique(experience.map_id[np.char.startswith(experience.source, "following")])[::7]
+    return experience.select(np.isin(experience.map_id, maps))
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory: pytest.TempPathFactory) -> tuple[Experience, MindModel]:
+    """Goals that move."""
+    experience = experience_of("false_belief", tmp_path_factory.mktemp("moving"))
+    return experience, learn_minds(CODEC, experience, {"for": "tests"})
+
+
+@pytest.fixture(scope="module")
+def model(moving: tuple[Experience, MindModel]) -> MindModel:
+    return moving[1]
+
+
+@pytest.fixture(scope="module")
+def ways(model: MindModel) -> Ways:
+    return Ways(model, CODEC, 0.99)
+
+
+def starts(model: MindModel) -> list[Node]:
+    return [
+        (s, 0, p, k, k, -1, 0)
+        for s, p, _ in model.intentions.starts.tolist()
+        for k in range(2)
+        if model.scenes.goals[s, k] >= 0
+    ]
+
+
+def test_robots_that_rest_are_found_out(moving: tuple[Experience, MindModel]) -> None:
+    experience = moving[0]
+    following = experience.select(np.char.startswith(experience.source, "following"))
+    _, moved = learn_frame(following)
+    rests = (following.t - following.t.min()) % 5 == 4  # robot_rest of the variant
+    assert not moved[rests & (following.action != STAY)].any()
+    assert moved[~rests & (following.action < FORWARD)].all()
+    chance = moving[1].moved_chance
+    assert chance[4::5, 0].max() < 0.01 and chance[:4, 0, 0, 0].min() > 0.99
+    assert chance[0, FORWARD, 1].max() < 0.05 and chance[0, FORWARD, 0, 1] < 0.05 and chance[0, FORWARD, 0, 0] > 0.99
+
+
+def test_scenes_are_the_maps(model: MindModel) -> None:
+    grids, _ = load_domain("person_following").maps("false_belief")
+    scenes = model.scenes
+    for s in range(MAPS):
+        fitting = 0
+        for grid in grids:
+            true = np.full_like(scenes.kinds[s], UNSEEN)
+            # the robot starts at (1, 1) and looks to the right, along the map's x; its right-hand side is the map's y
+            for x in range(9):
+                for y in range(9):
+                    side, ahead = y - 1 - scenes.origin, x - 1 - scenes.origin
+                    if 0 <= side < len(true) and 0 <= ahead < len(true):
+                        true[side, ahead] = grid[x, y]
+            known = (scenes.kinds[s] != UNSEEN) & (true != UNSEEN) & (scenes.kinds[s] != GOAL) & (true != GOAL)
+            fitting += bool((scenes.kinds[s] == true)[known].all())
+        assert fitting == 1
+    found = (scenes.goals >= 0).sum(1)
+    assert found.max() == 2 and found.mean() > 1.5  # two each; some of them are far from where anybody came
+
+
+def test_walks_are_shortest(model: MindModel) -> None:
+    scenes = model.scenes
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        s = int(rng.integers(MAPS))
+        stations, cells = np.flatnonzero(scenes.cell[s] >= 0), np.unique(scenes.cell[s][scenes.cell[s] >= 0])
+        q, c = int(rng.choice(stations)), int(rng.choice(cells))
+        length = int(scenes.walk[s, q, c])
+        after = scenes.walk[s, scenes.follows[s, q], c].astype(int)
+        assert (length == 0) == (scenes.cell[s, q] == c)
+        if 0 < length < FAR:
+            assert after.min() == length - 1
+
+
+def test_stations_show_what_robots_saw(moving: tuple[Experience, MindModel]) -> None:
+    experience, model = moving
+    first = experience.select((experience.t == experience.t.min()) & (experience.source == "following-mixture"))
+    scene = np.searchsorted(model.scenes.keys, first.map_id)
+    begin = model.scenes.station(scene, np.tile([0, 0, 3], (len(first), 1)))
+    assert (model.scenes.view[scene, begin] == first.view).all()
+
+
+def test_the_goal_is_found_to_move_once_and_unseen(model: MindModel) -> None:
+    chances = np.array([[model.vanish_chance(t, seen) for seen in (False, True)] for t in range(20)])
+    assert chances[2, 0] > 0.9  # goal_moves_at 3: in the third step
+    assert np.delete(chances[:, 0], 2).max() < 0.1 and chances[:, 1].max() < 0.1
+
+
+def test_intentions_are_found_without_being_logged(moving: tuple[Experience, MindModel]) -> None:
+    model = moving[1]
+    rows = model.intentions.counts.sum(-1) > 5
+    sure = model.intentions.counts.max(-1)[rows] / model.intentions.counts.sum(-1)[rows]
+    assert sure.mean() > 0.95  # persons' plans are deterministic given the goal
+    assert model.policy[rows].sum(-1) == pytest.approx(1.0)
+
+
+def brute_force(
+    ways: Ways, model: MindModel, actions: list[int], seen: list[tuple[np.ndarray, np.ndarray | None]]
+) -> dict[tuple[int, int, int], float]:
+    """P(s, z, g | what was seen), by going through every course of events one by one."""
+    scenes, noise = model.scenes, max(model.code_noise, 1e-4)
+    found: dict[tuple[int, int, int], float] = {}
+
+    def sight(s: int, q: int, p: int) -> bool:
+        return bool(scenes.sees[s, q, scenes.cell[s, p]] and scenes.cell[s, q] != scenes.cell[s, p])
+
+    def likelihood(s: int, q: int, p: int, gone: int, k: int) -> float:
+        code, pose = seen[k]
+        if sight(s, q, p) != (pose is not None):
+            return 0.0
+        if pose is not None and tuple(scenes.relative(*map(np.array, ([s], [q], [p])))[0]) != tuple(pose):
+            return 0.0
+        view = scenes.view[s, q].copy()
+        for candidate, cell in enumerate(scenes.goals[s]):
+            covered = pose is not None and scenes.cell[s, p] == cell
+            if cell >= 0 and scenes.sees[s, q, cell] and (candidate == gone or covered):
+                vx, vy = scenes.place_in_view(*map(np.array, ([s], [q], [cell])), 5)
+                view[vx[0], vy[0]] = 0
+        wrong = int((CODEC.codes(view[None])[0] != code).sum())
+        return float((1 - noise) ** (len(code) - wrong) * noise**wrong)
+
+    def walk(k: int, weight: float, s: int, q: int, p: int, z: int, g: int, gone: int, lost: int, stood: int) -> None:
+        weight *= likelihood(s, q, p, gone, k)
+        if weight <= 0.0:
+            return
+        if k == len(actions):
+            found[s, z, g] = found.get((s, z, g), 0.0) + weight
+            return
+        action = actions[k]
+        options = [(g, gone, 1.0)]
+        if gone < 0:
+            chance = model.vanish_chance(k, ways.seen(s, p, g))
+            options = [(g, gone, 1.0 - chance), (1 - g, g, chance)]
+        faced = scenes.follows[s, q, FORWARD]
+        person_ahead = faced != q and scenes.cell[s, faced] == scenes.cell[s, p]
+        wall = action == FORWARD and faced == q
+        moved = 1.0 if action == STAY else float(model.moved_chance[k, action, int(wall), int(person_ahead)])
+        for own, left, share in options:
+            for then, moves in ((int(scenes.follows[s, q, action]), moved), (q, 1.0 - moved)):
+                if moves == 0.0 or share == 0.0:
+                    continue
+                for u in range(4):
+                    there = int(scenes.follows[s, p, u]) if u != STAY else p
+                    heads = own if own != z and ways.seen(s, there, z) else z
+                    cell, person = scenes.cell[s, then], scenes.cell[s, there]
+                    length = min(int(scenes.walk[s, then, person]), MAX_WALK)
+                    home = scenes.goals[s, own]
+                    front = scenes.follows[s, then, FORWARD]
+                    standing = min(stood + 1, 8) if person == home else 0
+                    variables = (
+                        length,
+                        int(sight(s, then, there)),
+                        int(person == home),
+                        standing,
+                        lost,
+                        int(cell == home and then != q and action == FORWARD),
+                        int(action == FORWARD and front != then and scenes.cell[s, front] == person),
+                        int(cell == person),
+                    )
+                    goes_on = float(model.judgement[variables][1])
+                    after = int(model.lost_chance[length, lost].argmax())
+                    chance = weight * share * moves * float(model.policy[s, z, p, u]) * goes_on
+                    walk(k + 1, chance, s, then, there, heads, own, left, after, standing)
+
+    for s, p, count in model.intentions.starts.tolist():
+        for z in range(2):
+            walk(0, count * float(model.intentions.prior[s, z]), s, 0, p, z, z, -1, 0, 0)
+    total = sum(found.values())
+    return {key: weight / total for key, weight in found.items()}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_filter_is_brute_force_bayes(model: MindModel, ways: Ways, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    node, q = starts(model)[int(rng.integers(2 * MAPS))], 0
+    actions: list[int] = []
+    seen: list[tuple[np.ndarray, np.ndarray | None]] = []
+    scenes = model.scenes
+    for k in range(5):
+        s, p = node[SCENE], node[PLACE]
+        visible = scenes.sees[s, q, scenes.cell[s, p]] and scenes.cell[s, q] != scenes.cell[s, p]
+        hidden = 0 if node[GONE] < 0 else 1 << node[GONE]
+        pose = scenes.relative(*map(np.array, ([s], [q], [p])))[0] if visible else None
+        seen.append((ways.codes[ways.packed.shows[s, q, hidden]], pose))
+        if k == 4:
+            break
+        action = int(rng.choice([0, 1, 2, 2, 3]))
+        after = ways.successors(node)
+        node = max(after, key=lambda one: after[one])
+        q = int(scenes.follows[s, q, action])
+        actions.append(action)
+    belief = MindBelief(ways, "perspective-shift", rng)
+    belief.reset(*seen[0])
+    for action, (code, pose) in zip(actions, seen[1:], strict=True):
+        belief.update(action, code, pose)
+    assert belief.resets == 0
+    exact = brute_force(ways, model, actions, seen)
+    found: Counter[tuple[int, int, int]] = Counter()
+    for (one, _, _), weight in belief.weights.items():
+        found[one[SCENE], one[HEADS_FOR], one[OWN]] += weight  # type: ignore[assignment]
+    for key, weight in exact.items():
+        assert found[key] == pytest.approx(weight, abs=1e-4)
+
+
+def test_the_influence_is_the_mixture_of_the_policy(model: MindModel, ways: Ways) -> None:
+    belief = MindBelief(ways, "perspective-shift", np.random.default_rng(0))
+    node = starts(model)[0]
+    other = (*node[:HEADS_FOR], 1 - node[HEADS_FOR], *node[OWN:])
+    belief.weights = {(node, 0, 0): 0.3, (other, 0, 0): 0.7}  # type: ignore[dict-item]
+    policy = model.policy[node[SCENE], :, node[PLACE]]
+    assert belief.influence() == pytest.approx(0.3 * policy[node[HEADS_FOR]] + 0.7 * policy[other[HEADS_FOR]])
+
+
+def test_persons_learn_of_a_moved_goal_by_seeing_or_as_the_mode_has_it(model: MindModel, ways: Ways) -> None:
+    knowing = Ways(model, CODEC, 0.99, slack=0.01)
+    mistaken = 0
+    for start in starts(model):
+        node = start
+        for _ in range(8):
+            after = ways.successors(node)
+            node = max(after, key=lambda one: after[one])
+            if node[GONE] >= 0:
+                assert (node[HEADS_FOR] != node[OWN]) <= (not ways.seen(node[SCENE], node[PLACE], node[GONE]))
+                mistaken += node[HEADS_FOR] != node[OWN]
+        node = start
+        for _ in range(8):
+            after = knowing.successors(node)
+            node = max(after, key=lambda one: after[one])
+            assert node[HEADS_FOR] == node[OWN]
+    assert mistaken > 0
+
+
+def test_modes_put_other_things_in_the_persons_mind(model: MindModel, ways: Ways) -> None:
+    scenes = model.scenes
+    s, _, p, z, *_ = starts(model)[0]
+    code = ways.codes[ways.packed.shows[s, 0, 0]]
+    pose = scenes.relative(*map(np.array, ([s], [0], [p])))[0]
+    place = scenes.place[s, scenes.goals[s, z]]  # at the start the frame is the robot's own
+    found: dict[str, np.ndarray] = {}
+    for mode in ("zero", "random", "perfect-information"):
+        belief = MindBelief(ways, mode, np.random.default_rng(1))
+        belief.reset(code, pose, ((int(place[0]), int(place[1])), (int(place[0]), int(place[1]))))
+        weights = np.zeros((MAPS, 2))
+        for (node, _, _), weight in belief.weights.items():
+            weights[node[SCENE], node[HEADS_FOR]] += weight
+        found[mode] = weights[s] / weights[s].sum()
+    assert found["zero"] == pytest.approx([0.5, 0.5])
+    assert sorted(found["random"]) == pytest.approx([0.0, 1.0])
+    assert found["perfect-information"][z] == pytest.approx(1.0)
+
+
+def test_values_satisfy_bellmans_equation(model: MindModel) -> None:
+    ways = Ways(model, CODEC, 0.9)
+    ways.numbers(starts(model))
+    packed, scenes = ways.packed, model.scenes
+    rng = np.random.default_rng(2)
+    checked = 0
+    for number in rng.choice(len(packed.node), 60, replace=False):
+        s, t, p = packed.node[number, [SCENE, CLOCK, PLACE]]
+        if packed.successor[number, 0] < 0:
+            continue
+        q, lost = int(rng.choice(np.flatnonzero(scenes.cell[s] >= 0))), int(rng.integers(model.num_lost))
+        values = []
+        for action in range(4):
+            faced = scenes.follows[s, q, FORWARD]
+            ahead = int(faced != q and scenes.cell[s, faced] == scenes.cell[s, p])
+            moved = model.moved_chance[t, action, int(action == FORWARD and faced == q), ahead] if action != STAY else 1
+            total, below = 0.0, 0.0
+            for after, reached in zip(packed.successor[number], packed.chance[number], strict=True):
+                if after < 0:
+                    break
+                share, below = reached - below, reached
+                _, _, there, _, own, _, standing = packed.node[after]
+                for then, chance in ((scenes.follows[s, q, action], moved), (q, 1 - moved)):
+                    if chance < 0.01:
+                        continue
+                    cell, person, home = scenes.cell[s, then], scenes.cell[s, there], scenes.goals[s, own]
+                    length = min(int(scenes.walk[s, then, person]), MAX_WALK)
+                    front = scenes.follows[s, then, FORWARD]
+                    reward, goes_on = model.judgement[
+                        length,
+                        int(scenes.sees[s, then, person] and cell != person),
+                        int(person == home),
+                        standing,
+                        lost,
+                        int(cell == home and then != q and action == FORWARD),
+                        int(action == FORWARD and front != then and scenes.cell[s, front] == person),
+                        int(cell == person),
+                    ]
+                    later = packed.value[after, then, model.lost_chance[length, lost].argmax()]
+                    total += share * chance * (reward + 0.9 * goes_on * later)
+            values.append(total)
+        assert packed.value[number, q, lost] == pytest.approx(max(values), abs=1e-3)
+        checked += 1
+    assert checked > 20
+
+
+def test_simulated_steps_follow_the_model(model: MindModel, ways: Ways) -> None:
+    number = int(ways.numbers(starts(model)[:1])[0])
+    tree, bits = MindTree(ways.packed), stream(np.random.default_rng(0))
+    state, after, scratch = np.array([number, 0, 0]), np.zeros(3, np.int64), np.zeros(1, np.int64)
+    counts: Counter[int] = Counter()
+    for _ in range(4000):
+        mind_advance(tree, state, 0, after, scratch, bits)
+        counts[int(after[0])] += 1
+    chances = np.diff(np.concatenate([[0.0], ways.packed.chance[number]]))
+    for successor, chance in zip(ways.packed.successor[number], chances, strict=True):
+        if successor >= 0:
+            assert counts[int(successor)] / 4000 == pytest.approx(chance, abs=0.04)
+
+
+def test_the_search_is_worth_its_leaves_where_all_is_known(model: MindModel, ways: Ways) -> None:
+    belief = MindBelief(ways, "perspective-shift", np.random.default_rng(0))
+    node = starts(model)[0]
+    belief.weights = {(node, 0, 0): 1.0}
+    search = MindSearch(ways, SearchConfig(simulations=400, depth=6), np.random.default_rng(0))
+    action, info = search.plan(belief.particles())
+    value = float(ways.packed.value[ways.numbers([node])[0], 0, 0])
+    assert info["values"][action] <= value + 0.05 * abs(value) + 0.1
+    assert info["values"][action] > value - 0.3 * abs(value) - 0.5
+    masked, _ = search.plan(belief.particles(), np.arange(4) == (action + 1) % 4)
+    assert masked == (action + 1) % 4
+    again = MindSearch(ways, SearchConfig(simulations=400, depth=6), np.random.default_rng(0)).plan(belief.particles())
+    assert again[1]["values"] == info["values"]
+    seen = int(search.tree.key[search.tree.owner >= 0][0])
+    assert search.describe(seen).startswith("code ")
+
+
+def test_what_nothing_explains_is_passed_over(model: MindModel, ways: Ways) -> None:
+    belief = MindBelief(ways, "perspective-shift", np.random.default_rng(0))
+    s, _, p, *_ = starts(model)[0]
+    pose = model.scenes.relative(*map(np.array, ([s], [0], [p])))[0]
+    code = ways.codes[ways.packed.shows[s, 0, 0]]
+    belief.reset(code, pose)
+    assert belief.resets == 0
+    assert belief.update(STAY, code, np.array([2, 0, 1])) == -np.inf  # the person cannot have come there
+    assert belief.resets == 1 and sum(belief.weights.values()) == pytest.approx(1.0)
+
+
+def test_stored_models_are_the_same_and_damage_is_named(model: MindModel, tmp_path: Path) -> None:
+    model.save(tmp_path)
+    again = MindModel.load(tmp_path)
+    assert np.array_equal(again.policy, model.policy) and np.array_equal(again.judgement, model.judgement)
+    assert np.array_equal(again.scenes.walk, model.scenes.walk) and again.provenance == {"for": "tests"}
+    path = tmp_path / "minds.npz"
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(UserError, match=r"minds\.npz"):
+        MindModel.load(tmp_path)
+
+
+def test_several_goals_are_noticed(moving: tuple[Experience, MindModel]) -> None:
+    experience = moving[0]
+    assert several_goals(experience)
+    alone = (experience.view == GOAL).reshape(len(experience), -1).sum(1) < 2
+    assert not several_goals(experience.select(alone))
+    assert (experience.view == WALL).any()
