@@ -168,7 +168,7 @@ def brute_force(
         for candidate, cell in enumerate(scenes.goals[s]):
             covered = pose is not None and scenes.cell[s, p] == cell
             if cell >= 0 and scenes.sees[s, q, cell] and (candidate == gone or covered):
-                vx, vy = scenes.place_in_view(*map(np.array, ([s], [q], [cell])), 5)
+                vx, vy = scenes.place_in_view(np.array([s]), np.array([q]), np.array([cell]), 5)
                 view[vx[0], vy[0]] = 0
         wrong = int((CODEC.codes(view[None])[0] != code).sum())
         return float((1 - noise) ** (len(code) - wrong) * noise**wrong)
