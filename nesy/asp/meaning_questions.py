@@ -29,10 +29,7 @@ class MeaningQuestions(Subject):
             UserError: no such factor or value.
         """
         started = time.perf_counter()
-        f = self.factor(factor)
-        if not 0 <= value < self.dbn.num_values:
-            raise UserError(f"no value {value}; the values of a factor are 0 to {self.dbn.num_values - 1}")
-        name = f"{self.dbn.factor_names[f]} = {value}"
+        f, name = self._value(factor, value)
         text, rows = meaning_of(self.facts, self.book, f, value, least)
         support: list[Edge] = [
             (name, row["predicate"] if row["relation"] == "means" else f"not {row['predicate']}", _share(row))
@@ -55,12 +52,9 @@ class MeaningQuestions(Subject):
         from nesy.asp.semantics import ordered, value_rules
 
         started = time.perf_counter()
-        f = self.factor(factor)
-        if not 0 <= value < self.dbn.num_values:
-            raise UserError(f"no value {value}; the values of a factor are 0 to {self.dbn.num_values - 1}")
+        f, name = self._value(factor, value)
         names = ordered(self.book.predicate_names)
         found = value_rules(self.book, f, value, held_out=held_out)
-        name = f"{self.dbn.factor_names[f]} = {value}"
         row = {
             "precision": found.precision,
             "recall": found.recall,
@@ -72,6 +66,17 @@ class MeaningQuestions(Subject):
         support = [(sentence(rule, names, True), name, f"{rule.right} of {rule.applies} views") for rule in found.rules]
         text = readable(found, names, predicates=True).replace(found.target, name)
         return finding(f"When is {name}?", text, [row], started, support)
+
+    def _value(self, factor: int | str, value: int) -> tuple[int, str]:
+        """The number of a factor, and what `factor = value` is called.
+
+        Raises:
+            UserError: no such factor or value.
+        """
+        f = self.factor(factor)
+        if not 0 <= value < self.dbn.num_values:
+            raise UserError(f"no value {value}; the values of a factor are 0 to {self.dbn.num_values - 1}")
+        return f, f"{self.dbn.factor_names[f]} = {value}"
 
     def _value_rule(self, f: int, value: int) -> tuple[str, list[str]]:
         """The rule for a value learned from all views, as a line, and its conjunctions."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nesy.cli.benches.measuring import Row, Settings
+from nesy.errors import UserError
 
 if TYPE_CHECKING:
     from nesy.asp import KnowledgeBase
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
 
 NEEDS: tuple[str, ...] = ("extract",)
 FACTORS, VALUES = 8, 8
+PLAN, STARTS = 6, 20
+"""Longest plan, and from how many codes one of that length is looked for."""
 
 
 def measure(settings: Settings) -> list[Row]:
@@ -78,17 +81,49 @@ def _of_the_run(settings: Settings) -> list[Row]:
     book = base.book
     rng = np.random.default_rng(settings.seed)
     action = base.dbn.action_names[-2]
-    start = book.codes[book.counts.argmax()]
+    start, goal, steps = _farthest(base, rng)
     particles = book.codes[rng.integers(len(book), size=1000)]
     names = [name for name in ("wall_ahead", "goal_visible") if name in book.predicate_names]
+    # a code and its opposite: no plan leads to both
+    nowhere = f"{goal}, {goal.split(',')[0].replace('=', '!=')}"
     questions: list[tuple[str, Callable[[], Any], float]] = [
         ("factors that an action influences", lambda: base.influenced(action), 20.0),
-        ("shortest plan, 6 steps at most", lambda: base.plan(start, names[-1], 6), 150.0),
+        (f"shortest plan to a code {steps} steps away", lambda: base.plan(start, goal, PLAN), 150.0),
+        (f"that no plan of {PLAN} steps leads to a goal", lambda: base.plan(start, nowhere, PLAN), 150.0),
         ("knows and holds possible, 1000 particles", lambda: base.knows(particles, names), 20.0),
         ("one step of the run's own model, all codes", lambda: base.verify(action, names[0], "same"), 500.0),
     ]
+    assert base.plan(start, goal, PLAN).rows[0]["actions"] is not None
     rows = [_row(what, _median(ask, settings.seconds), limit) for what, ask, limit in questions]
     return [*rows, _row("shield, per decision in a new situation", _shield(base, rng), 2.0)]
+
+
+def _farthest(base: KnowledgeBase, rng: np.random.Generator) -> tuple[np.ndarray, str, int]:
+    """A code to start from and one to reach by most probable outcomes, as many steps away as can be found, and these.
+
+    At most `PLAN` steps, from a few codes met; the goal is written as a condition.
+    """
+    from nesy.dbn.inference import most_probable_next
+
+    found: tuple[int, np.ndarray, np.ndarray] | None = None
+    for start in base.book.codes[rng.integers(len(base.book), size=STARTS)]:
+        seen, level = {tuple(start.tolist())}, [start.astype(np.int64)]
+        for steps in range(1, PLAN + 1):
+            following = [
+                code
+                for action in range(base.dbn.num_actions)
+                for code in most_probable_next(base.dbn, np.array(level), action)[0].astype(np.int64)
+            ]
+            level = [code for code in following if tuple(code.tolist()) not in seen]
+            if not level:
+                break
+            seen |= {tuple(code.tolist()) for code in level}
+            if found is None or steps > found[0]:
+                found = (steps, start, level[0])
+    if found is None:
+        raise UserError("no action of this model changes any code: there is nothing to plan")
+    steps, start, goal = found
+    return start, ", ".join(f"{n}={v}" for n, v in zip(base.dbn.factor_names, goal.tolist(), strict=True)), steps
 
 
 def _shield(base: KnowledgeBase, rng: np.random.Generator) -> float:
