@@ -106,8 +106,13 @@ def _entries(dbn: TwoSliceDBN) -> list[str]:
             for row in np.flatnonzero((table.counts(a, 0) > 0) & (np.abs(values) > 1e-9)).tolist():
                 index = ", ".join(f"@v{v}" for v in np.unravel_index(row, shape)) if shape else ""
                 place = f"({index})" if index else ""
-                lines.append(f"    {name}_{a}{place} = {np.format_float_positional(values[row], trim="0")};")
+                lines.append(f"    {name}_{a}{place} = {_number(values[row])};")
     return lines
+
+
+def _number(value: float) -> str:
+    """All digits, and at least one after the point: `1.` is no number in RDDL."""
+    return np.format_float_positional(value, trim="0")
 
 
 def _instance(dbn: TwoSliceDBN, code: np.ndarray, horizon: int, every: bool) -> str:
@@ -120,7 +125,7 @@ def _instance(dbn: TwoSliceDBN, code: np.ndarray, horizon: int, every: bool) -> 
                 context = np.unravel_index(row, shape) if shape else ()
                 for k, p in enumerate(table[row].tolist()):
                     index = ", ".join(f"@v{v}" for v in (*context, k))
-                    lines.append(f"    p_{a}_{i}({index}) = {np.format_float_positional(p, trim="0")};")
+                    lines.append(f"    p_{a}_{i}({index}) = {_number(p)};")
     lines += _entries(dbn)
     start = " ".join(f"x{i} = @v{int(v)};" for i, v in enumerate(code))
     lines += ["  };", "}", "instance start {", "  domain = dbn;", "  non-fluents = tables;"]
