@@ -44,6 +44,8 @@ MOST_PARENTS = 5
 """Parents of a factor in both slices together: a table has `values ** MOST_PARENTS` rows at most."""
 LEARNING_SCALE = 0.3
 """Share of the configured step size that suits plain perceptrons."""
+CALMER = 0.1
+"""Factor on it in the last stage, which goes on from what is learned."""
 FIT_EPOCHS = 40
 """Epochs that learning a code book may take at least: it is learned from scratch, whatever the number of epochs."""
 FIT_STEPS = 20
@@ -67,6 +69,7 @@ class SymbolicTrainer:
         predicates: PredicateVocabulary | None = None,
         reference: Transitions | None = None,
         ingredients: Ingredients | None = None,
+        refine_up_to: int | None = None,
     ) -> None:
         """Prepare the training.
 
@@ -79,10 +82,11 @@ class SymbolicTrainer:
             predicates: to ask about views; by default the kinds of cells.
             reference: what the gates are computed on at the end; `everything` by default.
             ingredients: of the loss where views are many.
+            refine_up_to: most views for which a code book is searched; `REFINE_UP_TO` by default.
         """
         self.config, self.everything, self.training, self.held_out = config, everything, training, held_out
         self.reference = everything if reference is None else reference
-        self.refines = everything.num_views <= REFINE_UP_TO
+        self.refines = everything.num_views <= (REFINE_UP_TO if refine_up_to is None else refine_up_to)
         self.ingredients = ingredients or Ingredients()
         self.device = torch.device(config.device)
         self.generator = torch.Generator().manual_seed(seed)
@@ -176,7 +180,7 @@ class SymbolicTrainer:
             self.finished = True
             return
         self.stage, self.epoch = later[0], 0
-        scale = LEARNING_SCALE * (1.0 if self.refines else 0.3)
+        scale = LEARNING_SCALE * (CALMER if len(later) == 1 else 1.0)
         self.optimizer = self._optimizer(self.config.learning_rate * scale)
 
     # ---------------------------------------------------------------- many views
@@ -207,10 +211,11 @@ class SymbolicTrainer:
         known = torch.arange(t.num_views) if self.stage == "complete" else torch.as_tensor(np.flatnonzero(t.visits))
         size = min(len(known), self.config.batch_size)
         steps = max(FIT_STEPS, min(MOST_STEPS, PASSES * len(known) // size))
+        chance = torch.as_tensor(t.weight, dtype=torch.float32)
         totals: dict[str, float] = {}
         for _ in range(steps):
             rows = known[torch.randperm(len(known), generator=self.generator)[:size]].to(self.device)
-            edges = torch.randint(len(t), (size,), generator=self.generator).numpy()
+            edges = torch.multinomial(chance, size, replacement=True, generator=self.generator).numpy()
             before, after = (model.one_hot(codes[torch.as_tensor(ends[edges])]) for ends in (t.source, t.target))
             action = torch.as_tensor(t.action[edges], device=self.device)
             parts = {
