@@ -51,7 +51,8 @@ def scores(
 
     Returns:
         `predicates`: predicates from codes, those that the code determines by few factors; `all_predicates`: all
-        that vary enough (without maps); `values`: values from predicates; each with `count`, macro averages
+        that vary enough (without maps); `by_factors`: the same by the least number of factors that settle a predicate;
+        `values`: values from predicates; each with `count`, macro averages
         `precision` and `recall` over held-out views, `length` (mean conditions of the rules from all views), the
         same by maps (`maps_precision`, `maps_recall`) and `each`, one record per predicate or value.
     """
@@ -85,14 +86,35 @@ def scores(
                 predicates=True,
             )
             values[f"{factor_name}={value}"] = {**record, "counts": True}
-    everything = {name: {**record, "counts": record["supported"]} for name, record in predicates.items()}
     return {
         "predicates": _macro(predicates),
-        "all_predicates": {name: figure for name, figure in _macro(everything).items() if name in OVERALL},
+        "all_predicates": _overall(predicates, supported),
+        "by_factors": {
+            str(number): _overall(predicates, names) for number, names in _by_factors(codebook, supported).items()
+        },
         "values": _macro(values),
         "folds": FOLDS,
         "views": len(codebook),
     }
+
+
+def _by_factors(codebook: Codebook, names: set[str]) -> dict[int, set[str]]:
+    """Predicates by the least number of factors that settle them; those that no number settles are left out."""
+    found: dict[int, set[str]] = {}
+    left = set(names)
+    for number in range(1, codebook.codes.shape[1] + 1):
+        if not left:
+            break
+        here = left & set(determined(codebook, number))
+        if here:
+            found[number] = here
+        left -= here
+    return found
+
+
+def _overall(each: dict[str, dict[str, Any]], names: set[str]) -> dict[str, Any]:
+    chosen = {name: {**record, "counts": name in names} for name, record in each.items()}
+    return {figure: value for figure, value in _macro(chosen).items() if figure in OVERALL}
 
 
 def folds(views: int, seed: int) -> list[np.ndarray]:

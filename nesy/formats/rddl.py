@@ -1,9 +1,12 @@
 """RDDL for pyRDDLGym: every table is a non-fluent indexed by the parents' values.
 
 Rows are many and RDDL is read slowly, so above `MAX_ENTRIES` only the rows met in experience are written; all
-others are then uniform, and the file says so. Where the model has them, the reward is a table of step means, and the
-state fluent `done` becomes true with the termination table's probability; rows of these two that were never met pay
-nothing and end nothing.
+others are then uniform, and the file says so. Where these are still too many, improbable entries are left out too
+(`LEAST`, the smallest that suffices): rows are weights then, divided by their sum when a value is drawn, and the file
+says how far a row is at most from the model's in total variation.
+
+Where the model has them, the reward is a table of step means, and the state fluent `done` becomes true with the
+termination table's probability; rows of these two that were never met pay nothing and end nothing.
 """
 
 from __future__ import annotations
@@ -19,6 +22,9 @@ from nesy.formats.bayes_nodes import identifier
 from nesy.run_folder import atomic_path
 
 MAX_ENTRIES = 200_000
+LEAST = (1e-6, 1e-4, 1e-3)
+NEGLIGIBLE = 1e-12
+"""Weight of an entry that is left out: so a row without any entry is uniform."""
 
 
 def write(dbn: TwoSliceDBN, path: Path, start: np.ndarray | None = None, horizon: int = 100) -> None:
@@ -34,25 +40,35 @@ def write(dbn: TwoSliceDBN, path: Path, start: np.ndarray | None = None, horizon
         UserError: the rows met in experience are too many for this format.
     """
     every = dbn.probabilities.size <= MAX_ENTRIES
-    if not every and int((dbn.row_counts > 0).sum()) * dbn.num_values > MAX_ENTRIES:
-        raise UserError(f"RDDL files hold at most {MAX_ENTRIES} probabilities; use another format, e.g. parquet")
+    met = dbn.probabilities[dbn.row_counts > 0]
+    least = 0.0
+    if not every and met.size > MAX_ENTRIES:
+        fitting = [p for p in LEAST if (met >= p).sum() <= MAX_ENTRIES]
+        if not fitting:
+            raise UserError(f"RDDL files hold at most {MAX_ENTRIES} probabilities; use another format, e.g. parquet")
+        least = fitting[0]
     code = dbn.initial.argmax(axis=1) if start is None else np.asarray(start)
     actions = [f"do_{identifier(name)}" for name in dbn.action_names]
-    left_out = "" if every else "// Rows never met in experience are uniform here.\n"
-    domain = left_out + _domain(dbn, actions)
+    remarks = [] if every else ["// Rows never met in experience are uniform here."]
+    if least:
+        apart = np.where(met < least, met, 0.0).sum(axis=1).max()
+        off = f"a row is at most {apart:.2g} from the model's in total variation"
+        remarks.append(f"// Entries below {least:g} are left out; {off}.")
+    domain = "\n".join([*remarks, _domain(dbn, actions, least)])
     with atomic_path(path) as temporary:
         temporary.write_text(domain, encoding="utf-8")
     with atomic_path(path.with_name(f"{path.stem}_instance{path.suffix}")) as temporary:
-        temporary.write_text(_instance(dbn, code, horizon, every), encoding="utf-8")
+        temporary.write_text(_instance(dbn, code, horizon, every, least), encoding="utf-8")
 
 
-def _domain(dbn: TwoSliceDBN, actions: list[str]) -> str:
+def _domain(dbn: TwoSliceDBN, actions: list[str], least: float) -> str:
+    draw, default = ("UnnormDiscrete", NEGLIGIBLE) if least else ("Discrete", 1.0 / dbn.num_values)
     values = ", ".join(f"@v{k}" for k in range(dbn.num_values))
     lines = ["domain dbn {", f"  types {{ val : {{ {values} }}; }};", "  pvariables {"]
     for a in range(dbn.num_actions):
         for i in range(dbn.num_factors):
             types = ", ".join(["val"] * (len(dbn.parents(a, i)) + 1))
-            lines.append(f"    p_{a}_{i}({types}) : {{ non-fluent, real, default = {1.0 / dbn.num_values:.17f} }};")
+            lines.append(f"    p_{a}_{i}({types}) : {{ non-fluent, real, default = {default:.17f} }};")
     for name, table in _outcomes(dbn).items():
         for a in range(dbn.num_actions):
             types = ", ".join(["val"] * len(table.parents(a, 0)))
@@ -69,7 +85,7 @@ def _domain(dbn: TwoSliceDBN, actions: list[str]) -> str:
         for a in reversed(range(dbn.num_actions)):
             parents = [f"x{p}" + ("'" if where else "") for where, p in dbn.parents(a, i)]
             index = ", ".join([*parents, "?v"])
-            branches = f"if ({actions[a]}) then Discrete_{{?v : val}}(p_{a}_{i}({index})) else ({branches})"
+            branches = f"if ({actions[a]}) then {draw}_{{?v : val}}(p_{a}_{i}({index})) else ({branches})"
         lines.append(f"    x{i}' = {branches};")
     ends = "termination" in dbn.step_tables
     if ends:
@@ -115,7 +131,7 @@ def _number(value: float) -> str:
     return np.format_float_positional(value, trim="0")
 
 
-def _instance(dbn: TwoSliceDBN, code: np.ndarray, horizon: int, every: bool) -> str:
+def _instance(dbn: TwoSliceDBN, code: np.ndarray, horizon: int, every: bool, least: float) -> str:
     lines = ["non-fluents tables {", "  domain = dbn;", "  non-fluents {"]
     for a in range(dbn.num_actions):
         for i in range(dbn.num_factors):
@@ -123,9 +139,9 @@ def _instance(dbn: TwoSliceDBN, code: np.ndarray, horizon: int, every: bool) -> 
             shape = (dbn.num_values,) * len(dbn.parents(a, i))
             for row in range(len(table)) if every else np.flatnonzero(counts).tolist():
                 context = np.unravel_index(row, shape) if shape else ()
-                for k, p in enumerate(table[row].tolist()):
+                for k in np.flatnonzero(table[row] >= least).tolist():
                     index = ", ".join(f"@v{v}" for v in (*context, k))
-                    lines.append(f"    p_{a}_{i}({index}) = {_number(p)};")
+                    lines.append(f"    p_{a}_{i}({index}) = {_number(table[row, k])};")
     lines += _entries(dbn)
     start = " ".join(f"x{i} = @v{int(v)};" for i, v in enumerate(code))
     lines += ["  };", "}", "instance start {", "  domain = dbn;", "  non-fluents = tables;"]

@@ -39,14 +39,18 @@ def _scores(found: dict[str, Any]) -> str:
         "all_predicates": "predicates from codes, all",
         "values": "values from predicates",
     }
+    figures = [(title, found[kind]) for kind, title in kinds.items()]
+    # a run measured by an earlier version has none
+    for number, record in found.get("by_factors", {}).items():
+        figures.append((f"predicates from codes, settled by {number} factor{'s' * (number != '1')}", record))
     rows = [
         [
             title,
-            str(found[kind]["count"]),
-            *(_share(found[kind].get(name)) for name in ("precision", "recall", "maps_precision", "maps_recall")),
-            f"{found[kind].get('length', 0.0):.1f}",
+            str(record["count"]),
+            *(_share(record.get(name)) for name in ("precision", "recall", "maps_precision", "maps_recall")),
+            f"{record.get('length', 0.0):.1f}",
         ]
-        for kind, title in kinds.items()
+        for title, record in figures
     ]
     caption = (
         f"Rules learned from three quarters of {found['views']} distinct views and scored on the others, each view "

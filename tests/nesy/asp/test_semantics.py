@@ -84,6 +84,9 @@ def test_scores_of_readable_codes(readable):
     assert found["values"]["precision"] >= 0.95 and found["values"]["recall"] >= 0.95
     assert found["values"]["length"] <= 3
     assert found["predicates"]["maps_recall"] >= 0.99
+    groups = found["by_factors"]
+    assert groups["1"]["precision"] >= 0.99 and groups["1"]["recall"] >= 0.99
+    assert sum(group["count"] for group in groups.values()) == found["all_predicates"]["count"]
     assert found["values"]["each"]["A=5"]["text"] == ["wall_ahead and not goal_visible and opening_visible"]
 
 
