@@ -141,17 +141,22 @@ def _planner(cell: Cell, run: RunFolder, domain: Domain, config: CompareConfig, 
     from planners.ialm import IALM
 
     home = ialm_folder(run, cell.variant)
+    model = plain = IALM.load(home)
+    if config.rules:
+        from planners.influence_rules import constrain_influence
+
+        model, _ = constrain_influence(model, [Path(rule) for rule in config.rules], codec, domain)
     if cell.agent == "search" and (home / "minds.json").is_file():
         from planners.mind_agent import MindAgent
         from planners.minds import MindModel
 
         minds = MindModel.load(home)
-        return MindAgent(minds, codec, cell.influence, config.search_of_cells, domain.spec.geometry, seed)
-    model = IALM.load(home)
-    if config.rules:
-        from planners.influence_rules import constrain_influence
-
-        model, _ = constrain_influence(model, [Path(rule) for rule in config.rules], codec, domain)
+        agent = MindAgent(minds, codec, cell.influence, config.search_of_cells, domain.spec.geometry, seed)
+        if model is not plain:
+            agent.ways.constrain(
+                (model.influence_of(agent.ways.codes) > 0) | (plain.influence_of(agent.ways.codes) <= 0)
+            )
+        return agent
     return PlanningAgent(cell.agent, model, config.search_of_cells, domain.spec.geometry, seed)
 
 

@@ -121,7 +121,7 @@ class MindBelief:
         """I(u | l) = sum over (p, z) of pi(u | p, z) b(p, z): float64 [4]."""
         out = np.zeros(4)
         for (node, _, _), weight in self.weights.items():
-            out += weight * self.ways.model.policy[node[SCENE], node[HEADS_FOR], node[PLACE]]
+            out += weight * self.ways.policy[node[SCENE], node[HEADS_FOR], node[PLACE]]
         return out / out.sum()
 
     @property

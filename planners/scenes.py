@@ -229,8 +229,8 @@ def learn_scenes(
     keys, scene = np.unique(maps, return_inverse=True)
     scene = scene.reshape(-1)
     cells = _cells_seen(frame, poses, width)  # [n, V, V, 2]
-    origin = int(cells.min())
-    size = int(cells.max()) - origin + 1
+    origin = int(cells.min()) - 1  # with a border of what nobody has seen
+    size = int(cells.max()) - origin + 2
     seen = np.zeros((len(keys), size, size, UNSEEN + 1), np.int64)
     shown = views != UNSEEN
     shown[:, width // 2, width - 1] = False  # its own cell is shown as empty, whatever it is

@@ -64,7 +64,7 @@ class Ways:
         scenes = model.scenes
         self.codes, shows = station_codes(model, codec)
         self.num_values = codec.num_values
-        self._policy = model.policy
+        self.policy = model.policy
         self._follows = scenes.follows.tolist()
         self._cell = scenes.cell.tolist()
         self._sees = scenes.sees
@@ -89,6 +89,14 @@ class Ways:
             shows,
         )
 
+    def constrain(self, possible: np.ndarray) -> None:
+        """Take moves out of pi that rules exclude for what the person sees: bool [U, moves] for `codes`."""
+        seen = possible[self.packed.shows[:, :, 0]][:, None]  # [S, 1, Q, moves]
+        kept = self.policy.copy()
+        kept[..., : possible.shape[1]] *= seen
+        total = kept.sum(-1, keepdims=True)
+        self.policy = np.where(total > 1e-12, kept / np.maximum(total, 1e-12), self.policy)
+
     def candidates(self, scene: int, gone: int = -1) -> list[int]:
         """The candidates of a scene, but for one that has vanished."""
         return [k for k, cell in enumerate(self._goals[scene]) if cell >= 0 and k != gone]
@@ -111,7 +119,7 @@ class Ways:
         for own, left, share in goals:
             for heads, known in self._heads(z, own):
                 weight = share * known
-                chances = self._policy[s, heads, p]
+                chances = self.policy[s, heads, p]
                 goal_cell = self._goals[s][own]
                 for u in range(NUM_MOVES):
                     then = self._follows[s][p][u] if u != STAY else p

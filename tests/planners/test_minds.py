@@ -265,6 +265,21 @@ def test_the_influence_is_the_mixture_of_the_policy(model: MindModel, ways: Ways
     assert belief.influence() == pytest.approx(0.3 * policy[node[HEADS_FOR]] + 0.7 * policy[other[HEADS_FOR]])
 
 
+def test_rules_take_moves_out_of_the_policy(model: MindModel) -> None:
+    ways = Ways(model, CODEC, 0.99)
+    s, _, p, z, *_ = starts(model)[0]
+    before = ways.policy[s, z, p].copy()
+    possible = np.ones((len(ways.codes), 3), np.bool_)
+    seen = int(ways.packed.shows[s, p, 0])
+    possible[seen, int(before[:3].argmax())] = False
+    ways.constrain(possible)
+    after = ways.policy[s, z, p]
+    assert after[before[:3].argmax()] == 0.0 and after.sum() == pytest.approx(1.0)
+    others = model.scenes.cell[s] >= 0
+    others[ways.packed.shows[s, :, 0] == seen] = False
+    assert ways.policy[s, z, others] == pytest.approx(model.policy[s, z, others])
+
+
 def test_persons_learn_of_a_moved_goal_by_seeing_or_as_the_mode_has_it(model: MindModel, ways: Ways) -> None:
     knowing = Ways(model, CODEC, 0.99, slack=0.01)
     mistaken = 0
