@@ -92,7 +92,7 @@ def make(options: Arguments) -> dict[str, Any]:
         output, config, 0, options.jobs, ConsoleProgress(), engine=options.engine, address=options.address
     )
     seconds = time.perf_counter() - started
-    result = {
+    result: dict[str, Any] = {
         "seconds": round(seconds, 1),
         "jobs": options.jobs,
         "episodes": options.episodes,
