@@ -50,6 +50,8 @@ class TrainConfig:
     named_factors: int = 6
     """Factors (of 8) whose values answer questions about the view; the rest complete the code. More of them make
     codes easier to read and the next code harder to predict."""
+    searches: int = 2
+    """Code books searched at most: there is another one where the first predicts the next code too badly to pass."""
     headline: tuple[str, ...] = ("wall_ahead", "goal_visible", "opening_visible")
     """Predicates that the first named factor answers in any case, where the domain has them."""
     mirror_images: bool = True

@@ -40,7 +40,7 @@ class Arguments:
         default_factory=lambda: CollectConfig(crossing_episodes=5000, following_episodes=3200)
     )
     """Experience."""
-    train: TrainConfig = field(default_factory=lambda: TrainConfig(held_out=0.0, time_limit=0.0))
+    train: TrainConfig = field(default_factory=lambda: TrainConfig(held_out=0.0, searches=1, time_limit=0.0))
     """Training."""
 
 

@@ -37,9 +37,9 @@ class Arguments:
     """How often to kill."""
     architecture: Literal["symbolic", "paper"] = "symbolic"
     """What to train."""
-    epochs: int = 8
+    epochs: int = 4
     """Epochs of the training."""
-    episodes: int = 60
+    episodes: int = 20
     """Episodes of each task to learn from."""
     seed: int = 0
     """Seed of the training, and of the moments."""

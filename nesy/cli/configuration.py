@@ -46,7 +46,7 @@ PRESETS: dict[str, RunConfig] = {
     "smoke": RunConfig(
         preset="smoke",
         collect=CollectConfig(crossing_episodes=100, following_episodes=100, shard_episodes=50),
-        train=TrainConfig(epochs=2, time_limit=0.0),
+        train=TrainConfig(epochs=2, searches=1, time_limit=0.0),
         compare=CompareConfig(
             episodes=42,
             planner_episodes=2,

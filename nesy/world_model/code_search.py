@@ -79,6 +79,7 @@ class CodeSearch:
         self._search = GroupSearch(questions, refiner, fixed, self.settings.told)
         self.groups: np.ndarray | None = None
         self.book: CodeBook | None = None
+        self._kept: tuple[np.ndarray | None, CodeBook] | None = None
 
     def start(self, rng: np.random.Generator) -> None:
         """Begin: with random questions, or with random codes where no factor is to be named."""
@@ -122,6 +123,17 @@ class CodeSearch:
             moved += adjusted
         return {"counted_nll": self.book.nll, "moved": moved, "noise": noise}
 
+    def keep(self) -> None:
+        """Remember the best of the code books that searches have ended with, this one included."""
+        assert self.book is not None
+        if self._kept is None or self.book.nll < self._kept[1].nll:
+            self._kept = self.groups, self.book
+        self.groups, self.book = self._kept
+
+    def again(self) -> None:
+        """Begin another search; what `keep` remembers stays."""
+        self.groups, self.book = None, None
+
     def search(self, questions_rounds: int, codes_rounds: int, rng: np.random.Generator) -> CodeBook:
         """Both steps after `start`, all rounds."""
         for done in np.linspace(0.0, 1.0, questions_rounds) if self.named else ():
@@ -141,19 +153,30 @@ class CodeSearch:
     # ---------------------------------------------------------------- state
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Everything that the next round depends on."""
-        if self.book is None:
-            return {}, {}
-        tensors = {"codes": torch.as_tensor(self.book.codes)}
-        if self.groups is not None:
-            tensors["groups"] = torch.as_tensor(self.groups)
-        return tensors, {"book": {"nll": self.book.nll, **structure_value(self.book.structure)}}
+        tensors: dict[str, Tensor] = {}
+        value: dict[str, Any] = {}
+        for name, found in {"": (self.groups, self.book), "kept_": self._kept or (None, None)}.items():
+            groups, book = found
+            if book is not None:
+                tensors[f"{name}codes"] = torch.as_tensor(book.codes)
+                value[f"{name}book"] = {"nll": book.nll, **structure_value(book.structure)}
+            if groups is not None:
+                tensors[f"{name}groups"] = torch.as_tensor(groups)
+        return tensors, value
 
     def restore(self, tensors: dict[str, Tensor], value: dict[str, Any]) -> None:
         """Continue from what `state` gave."""
-        if "book" in value:
-            book = value["book"]
-            self.book = CodeBook(tensors["codes"].numpy().copy(), structure_of(book), book["nll"])
-            self.groups = tensors["groups"].numpy().copy() if "groups" in tensors else None
+        self.groups, self.book = _book_of("", tensors, value)
+        groups, book = _book_of("kept_", tensors, value)
+        self._kept = None if book is None else (groups, book)
+
+
+def _book_of(name: str, tensors: dict[str, Tensor], value: dict[str, Any]) -> tuple[np.ndarray | None, CodeBook | None]:
+    if f"{name}book" not in value:
+        return None, None
+    book = value[f"{name}book"]
+    groups = tensors[f"{name}groups"].numpy().copy() if f"{name}groups" in tensors else None
+    return groups, CodeBook(tensors[f"{name}codes"].numpy().copy(), structure_of(book), book["nll"])
 
 
 def structure_value(structure: Structure) -> dict[str, Any]:

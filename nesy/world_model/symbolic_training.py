@@ -2,7 +2,7 @@
 
 1. `questions` and 2. `codes`: a code book is searched whose named factors answer questions about the view, and whose
    other factors make codes distinct and the next code predictable (`code_search.py`). Only steps on maps that are
-   not held out count.
+   not held out count. Where the codes predict too badly to pass, there is another search, and the better book stays.
 3. `fit`: encoder, decoder and inverse model learn the codes of the views met on those maps, until each is encoded to
    its code and rebuilt exactly. The gates on held-out maps are those of this stage.
 4. `complete`: the views met nowhere but on held-out maps, or by nobody, are learned too. The tables are then counted
@@ -29,7 +29,7 @@ from nesy.world_model.autoencoding import Autoencoding, ForwardGuide, Ingredient
 from nesy.world_model.code_search import CodeSearch, structure_of
 from nesy.world_model.codec import SymbolicCodec
 from nesy.world_model.distinct import Transitions
-from nesy.world_model.gates import evaluate, view_gates
+from nesy.world_model.gates import evaluate, limits, view_gates
 from nesy.world_model.held_out import HeldOut
 from nesy.world_model.networks import SymbolicWorldModel
 from nesy.world_model.questions import Questions
@@ -46,6 +46,8 @@ LEARNING_SCALE = 0.3
 """Share of the configured step size that suits plain perceptrons."""
 CALMER = 0.1
 """Factor on it in the last stage, which goes on from what is learned."""
+ENOUGH = 0.08
+"""Nats above the limit of the data at which a code book passes: the gate's margin less what steps never met cost."""
 FIT_EPOCHS = 40
 """Epochs that learning a code book may take at least: it is learned from scratch, whatever the number of epochs."""
 FIT_STEPS = 20
@@ -114,15 +116,20 @@ class SymbolicTrainer:
             self.search = CodeSearch(
                 self._refiner(training), questions, self.model.num_factors, config.named_factors, config.headline
             )
+        self.limit = limits(training)["next_code_nll"]
         self.held_out_figures: dict[str, Any] = {}
-        self.epoch, self.finished = 0, False
-        self.stage = next(stage for stage in self.stages if self._rounds(stage) > 0)
+        self.epoch, self.searches, self.finished = 0, 1, False
+        self.stage = self._first_stage()
         self.views = torch.as_tensor(everything.views, device=self.device)
 
     # ---------------------------------------------------------------- progress and time
     def length(self) -> int:
         """Most ticks that the run can take."""
-        return sum(self._rounds(stage) for stage in self.stages)
+        searched = sum(self._rounds(stage) for stage in ("questions", "codes"))
+        return sum(self._rounds(stage) for stage in self.stages) + (self.config.searches - 1) * searched
+
+    def _first_stage(self) -> str:
+        return next(stage for stage in self.stages if self._rounds(stage) > 0)
 
     def _rounds(self, stage: str) -> int:
         epochs = self.config.epochs
@@ -140,8 +147,9 @@ class SymbolicTrainer:
         """Seconds of the time limit after which the present stage must end."""
         if not self.config.time_limit:
             return math.inf
-        share = {"network": 0.7, "questions": 0.4, "codes": 0.8, "fit": 0.9, "complete": 0.97}[self.stage]
-        return share * self.config.time_limit
+        first = {"network": 0.7, "questions": 0.35, "codes": 0.7, "fit": 0.9, "complete": 0.97}
+        share = first if self.searches == 1 else {**first, "questions": 0.55, "codes": 0.8}
+        return share[self.stage] * self.config.time_limit
 
     def tick(self, elapsed: float) -> dict[str, Any]:
         """Do one epoch or round; `elapsed` is the time used so far, in seconds."""
@@ -171,6 +179,14 @@ class SymbolicTrainer:
     def _end_stage(self) -> None:
         if self.stage == "questions" and self.search is not None:
             self.search.separate()
+        if self.stage == "codes" and self.search is not None:
+            self.search.keep()
+            assert self.search.book is not None
+            if self.search.book.nll > self.limit + ENOUGH and self.searches < self.config.searches:
+                self.search.again()
+                self.searches += 1
+                self.stage, self.epoch = self._first_stage(), 0
+                return
         later = [s for s in self.stages[self.stages.index(self.stage) + 1 :] if self._rounds(s) > 0]
         if not later:
             if self.search is None:
@@ -283,6 +299,7 @@ class SymbolicTrainer:
         value: dict[str, Any] = {
             "stage": self.stage,
             "epoch": self.epoch,
+            "searches": self.searches,
             "finished": self.finished,
             "rng": self.rng.bit_generator.state,
             "rates": [[group["lr"], group.get("initial_lr", group["lr"])] for group in self.optimizer.param_groups],
@@ -311,7 +328,7 @@ class SymbolicTrainer:
         self.generator.set_state(tensors["generator"])
         self.rng.bit_generator.state = value["rng"]
         self.stage, self.epoch, self.finished = value["stage"], value["epoch"], value["finished"]
-        self.held_out_figures = value["held_out"]
+        self.held_out_figures, self.searches = value["held_out"], value["searches"]
         if "structure" in value:
             self.model.set_structure(structure_of(value["structure"]))
         if self.search is not None:

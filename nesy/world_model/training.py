@@ -170,6 +170,8 @@ def _check(config: TrainConfig) -> None:
         raise UserError(f"training: max_parents must be from 1 to 5, not {config.max_parents}")
     if not 0 <= config.named_factors <= 8:
         raise UserError(f"training: named_factors must be from 0 to 8, not {config.named_factors}")
+    if config.searches < 1:
+        raise UserError(f"training: searches must be at least 1, not {config.searches}")
     if not 0 <= config.held_out < 1:
         raise UserError(f"training: held_out must be in [0, 1), not {config.held_out}")
     try:

@@ -153,6 +153,24 @@ def test_where_views_are_many_gradients_alone_do_it(tmp_path: Path, toy, monkeyp
     assert metrics["held_out"]["next_code_nll"] >= metrics["held_out"]["limits"]["next_code_nll"] - 1e-9
 
 
+def test_another_search_where_the_first_predicts_too_badly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nesy.world_model.symbolic_training.ENOUGH", -1.0)  # no book is good enough
+    experience, whole, cut = toy_experience(), tmp_path / "whole", tmp_path / "cut"
+    train(experience, SMALL, whole, seed=1)
+    lines = lines_of(whole)
+    searched = ["questions"] * 3 + ["codes"] * 4
+    assert [line["stage"] for line in lines][:15] == [*searched, *searched, "fit"]
+    _, value = load_tensors(whole / "checkpoint.safetensors")
+    ends = [lines[6]["counted_nll"], lines[13]["counted_nll"]]
+    assert value["trainer"]["search"]["book"]["nll"] == min(ends)
+    for epochs in (7, 3, 4):  # after the first search, within the second, at its end
+        with pytest.raises(Killed):
+            train(experience, SMALL, cut, seed=1, progress=KilledAfter(epochs))
+    train(experience, SMALL, cut, seed=1)
+    expected, got = weights(whole), weights(cut)
+    assert all(torch.equal(expected[name], got[name]) for name in expected)
+
+
 def test_held_out_figures_are_of_maps_not_learned_from(trained: Path) -> None:
     metrics = json.loads((trained / "config.json").read_text())["metrics"]
     held_out = metrics["held_out"]
@@ -197,6 +215,7 @@ def test_damage_is_told_in_one_line(tmp_path: Path, trained: Path) -> None:
     [
         ({"epochs": 0}, "epochs"),
         ({"max_parents": 9}, "max_parents"),
+        ({"searches": 0}, "searches"),
         ({"held_out": 1.0}, "held_out"),
         ({"device": "nowhere"}, "--device"),
         ({"architecture": "other"}, "unknown architecture"),
