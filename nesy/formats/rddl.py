@@ -40,7 +40,9 @@ def write(dbn: TwoSliceDBN, path: Path, start: np.ndarray | None = None, horizon
         UserError: the rows met in experience are too many for this format.
     """
     every = dbn.probabilities.size <= MAX_ENTRIES
-    met = dbn.probabilities[dbn.row_counts > 0]
+    # where experience is not known, every row counts
+    told = dbn.row_counts > 0 if dbn.row_counts.any() else np.ones(len(dbn.row_counts), dtype=bool)
+    met = dbn.probabilities[told]
     least = 0.0
     if not every and met.size > MAX_ENTRIES:
         fitting = [p for p in LEAST if (met >= p).sum() <= MAX_ENTRIES]
@@ -49,6 +51,7 @@ def write(dbn: TwoSliceDBN, path: Path, start: np.ndarray | None = None, horizon
         least = fitting[0]
     code = dbn.initial.argmax(axis=1) if start is None else np.asarray(start)
     actions = [f"do_{identifier(name)}" for name in dbn.action_names]
+    every = every or bool(told.all())
     remarks = [] if every else ["// Rows never met in experience are uniform here."]
     if least:
         apart = np.where(met < least, met, 0.0).sum(axis=1).max()
