@@ -146,6 +146,8 @@ class SearchConfig:
     """Probability that the switching behaviour of these episodes acts at random."""
     mind_discount: float = 0.99
     """Discount per step where minds matter (several goals): what pays there pays late."""
+    mind_depth: int = 25
+    """Deepest step looked ahead there."""
     mind_exploration: float = 40.0
     """Weight of the exploration term there, in units of reward."""
     pomdp_py_simulations: int = 150

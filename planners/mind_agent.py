@@ -52,7 +52,7 @@ class MindSearch:
             self.tree,
             config.simulations,
             config.time_limit,
-            config.depth,
+            config.mind_depth,
             config.mind_discount,
             config.mind_exploration,
             False,

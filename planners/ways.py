@@ -70,6 +70,7 @@ class Ways:
         self._sees = scenes.sees
         self._goals = scenes.goals.tolist()
         self._of: dict[Node, int] = {}
+        self._nodes: list[Node] = []
         self._after: list[list[tuple[float, int]]] = []
         next_lost = model.lost_chance.argmax(-1).astype(np.int64)
         self.packed = PackedWays(
@@ -153,6 +154,7 @@ class Ways:
                 continue
             self._of[here] = len(self._of)
             order.append(here)
+            self._nodes.append(here)
             self._after.append([])
             if here[CLOCK] >= self.model.horizon or here[STANDING] >= MAX_STANDING:
                 continue
@@ -167,7 +169,7 @@ class Ways:
 
     def _pack(self, first: int) -> None:
         """Add the nodes from `first` on to the packed arrays, and value them from the last step to the first."""
-        fresh = list(self._of)[first:]
+        fresh = self._nodes[first:]
         successor = np.full((len(fresh), _MOST), -1, np.int64)
         chance = np.ones((len(fresh), _MOST))
         for i in range(len(fresh)):
@@ -175,16 +177,27 @@ class Ways:
             for j, (c, after) in enumerate(self._after[first + i]):
                 total += c
                 successor[i, j], chance[i, j] = after, total
+        used = first + len(fresh)
+        if used > len(self.packed.node):
+            self._grow(max(used, 2 * len(self.packed.node)))
         ways = self.packed
-        value = np.zeros((len(fresh), *ways.value.shape[1:]), np.float32)
-        self.packed = ways = ways._replace(
-            node=np.concatenate([ways.node, np.array(fresh, np.int64)]),
-            successor=np.concatenate([ways.successor, successor]),
-            chance=np.concatenate([ways.chance, chance]),
-            value=np.concatenate([ways.value, value]),
-        )
-        order = first + np.argsort(-ways.node[first:, CLOCK], kind="stable")
+        ways.node[first:used] = np.array(fresh, np.int64)
+        ways.successor[first:used] = successor
+        ways.chance[first:used] = chance
+        order = first + np.argsort(-ways.node[first:used, CLOCK], kind="stable")
         _value(ways, order, self.discount)
+
+    def __len__(self) -> int:
+        """Nodes; the packed arrays have room for more."""
+        return len(self._of)
+
+    def _grow(self, room: int) -> None:
+        grown = {}
+        for name in ("node", "successor", "chance", "value"):
+            old = getattr(self.packed, name)
+            grown[name] = np.zeros((room, *old.shape[1:]), old.dtype)
+            grown[name][: len(old)] = old
+        self.packed = self.packed._replace(**grown)
 
 
 def station_codes(model: MindModel, codec: Codec) -> tuple[np.ndarray, np.ndarray]:
