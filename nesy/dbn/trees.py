@@ -61,7 +61,8 @@ def conditional_tree(
         dbn: the model.
         action: the action.
         factor: the factor.
-        tolerance: total variation up to which rows count as equal.
+        tolerance: total variation up to which rows count as equal; a leaf may be a little further from some of its
+            rows, since it holds their mean. The error says how far at most.
         met_only: leave the rows never met in experience free.
     """
     table = dbn.cpt(action, factor)
@@ -134,7 +135,8 @@ def _grow(
     spread = 0.5 * np.abs(table[rows] - table[rows[0]]).sum(axis=1).max()
     if spread == 0.0:
         return Leaf(table[rows[0]], len(rows))
-    if 0.5 * np.abs(table[rows] - mean).sum(axis=1).max() <= tolerance:
+    # values put together level by level may end further from their mean than from each other; the error is stated
+    if not parents or 0.5 * np.abs(table[rows] - mean).sum(axis=1).max() <= tolerance:
         return Leaf(mean, len(rows))
     parent = max(parents, key=lambda p: (_gain(table, digits[:, p], rows, weights, num_values), -p))
     rest = tuple(p for p in parents if p != parent)

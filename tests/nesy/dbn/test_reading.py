@@ -96,6 +96,29 @@ def test_trees_are_exact_and_never_larger_than_the_table(seed):
                     np.testing.assert_array_equal(leaf.distribution, dbn.cpt(action, factor)[row])
 
 
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([1e-3, 0.02, 0.1, 0.4]))
+def test_rough_trees_state_their_error_and_are_no_larger_than_exact_ones(seed, tolerance):
+    rng = np.random.default_rng(seed)
+    dbn = random_dbn(rng, max_parents=3, num_values=3)
+    # few kinds of rows, each a little off: what is close to what is close need not be close
+    kinds = dbn.probabilities[rng.integers(3, size=len(dbn.probabilities))]
+    table = (1 - tolerance) * kinds + tolerance * rng.dirichlet(np.ones(3), size=len(kinds))
+    dbn = replace(dbn, probabilities=table)
+    for action in range(2):
+        for factor in range(3):
+            rough = conditional_tree(dbn, action, factor, tolerance)
+            shape = (3,) * len(dbn.parents(action, factor))
+            apart = [
+                0.5 * np.abs(look_up(rough.tree, np.array(np.unravel_index(row, shape) if shape else ())).distribution
+                             - dbn.cpt(action, factor)[row]).sum()
+                for row in range(dbn.num_rows(action, factor))
+            ]  # fmt: skip
+            assert rough.error == pytest.approx(max(apart), abs=1e-15)
+            assert rough.error <= 4 * tolerance
+            assert rough.leaves <= conditional_tree(dbn, action, factor).leaves
+
+
 def test_trees_put_values_together_and_state_their_error():
     dbn = toy()[0]
     tree = conditional_tree(dbn, 1, 1)
