@@ -137,11 +137,10 @@ def _stored(cell: Cell, path: Path, codec: Codec, mask: ActionMask | None, own_s
 
 
 def _planner(cell: Cell, run: RunFolder, domain: Domain, config: CompareConfig, seed: int, codec: Codec) -> Agent:
-    from planners.compare import ialm_folder
-    from planners.ialm import IALM
+    from planners.compare import ialm_folder, load_ialm
 
     home = ialm_folder(run, cell.variant)
-    model = plain = IALM.load(home)
+    model = plain = load_ialm(run, cell.variant)
     if config.rules:
         from planners.influence_rules import constrain_influence
 

@@ -13,7 +13,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -26,6 +26,9 @@ from nesy.run_folder import RunFolder, atomic_path, read_json, write_json
 from planners import config as settings
 from planners.config import CompareConfig, SearchConfig
 from planners.evaluation import Columns, evaluate, outcome_names
+
+if TYPE_CHECKING:
+    from planners.ialm import IALM
 
 MINDS_VERSION = 1
 """Of what is learned where minds matter (planners.minds)."""
@@ -158,14 +161,13 @@ def _report_influence_rules(run: RunFolder, config: CompareConfig, domain: Domai
         path.unlink(missing_ok=True)
         return
     from nesy.world_model import SymbolicCodec, load_world_model
-    from planners.ialm import IALM
     from planners.influence_rules import constrain_influence
 
     codec = SymbolicCodec(load_world_model(run.world_model))
     rules = [Path(rule) for rule in config.rules]
     changes = {}
     for variant in sorted(planning):
-        _, change = constrain_influence(IALM.load(ialm_folder(run, variant)), rules, codec, domain)
+        _, change = constrain_influence(load_ialm(run, variant), rules, codec, domain)
         changes[variant] = None if change is None else change.to_dict()
     write_json(path, changes)
 
@@ -224,6 +226,14 @@ def ialm_folder(run: RunFolder, variant: str) -> Path:
     path = run.ialm / "model.json"
     first = read_json(path).get("provenance", {}).get("variant", variant) if path.is_file() else variant
     return run.ialm if first == variant else run.ialm / variant
+
+
+def load_ialm(run: RunFolder, variant: str) -> IALM:
+    """The planner's model of a variant, over the run's 2DBN."""
+    from nesy.dbn import TwoSliceDBN
+    from planners.ialm import IALM
+
+    return IALM.load(ialm_folder(run, variant), TwoSliceDBN.load(run.dbn))
 
 
 def run_cell(

@@ -2,14 +2,17 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from nesy.errors import UserError
+from nesy.run_folder import RunFolder
 from planners import ialm, kernels
 from planners.beliefs import ParticleBelief
+from planners.compare import ialm_folder, load_ialm
 from planners.ialm import IALM, SCALARS
 from planners.random_bits import stream
 from tests.planners.models import K, N, small_ialm
@@ -167,6 +170,15 @@ def test_saved_and_loaded(tmp_path: Path) -> None:
         assert again.tables[name].names == model.tables[name].names
     assert np.array_equal(again.motion.coefficients, model.motion.coefficients)
     assert again.provenance == {"test": True}
+
+
+def test_a_run_holds_models_of_several_variants(tmp_path: Path) -> None:
+    run, first, second = RunFolder(tmp_path), small_ialm(7), small_ialm(8)
+    first.dbn.save(run.dbn)
+    for variant, model in (("paper", first), ("intent", second)):
+        replace(model, dbn=first.dbn, provenance={"variant": variant}).save(ialm_folder(run, variant))
+    for variant in ("paper", "intent"):
+        assert load_ialm(run, variant).provenance == {"variant": variant}
 
 
 def test_damaged_files_are_named(tmp_path: Path) -> None:
