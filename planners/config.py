@@ -179,7 +179,8 @@ class CompareConfig:
     """Time that the agents that search get per decision, instead of a number of simulations; 0 for the number.
     Agents compare at equal time then, but results no longer repeat exactly."""
     rules: tuple[str, ...] = ()
-    """Rule files (docs/asp.md) that no agent may break, neither while it learns nor when it acts."""
+    """Rule files (docs/asp.md) that no agent may break, neither while it learns nor when it acts. Rules about the
+    person act on what the planners expect of it."""
     policies: tuple[str, ...] = ()
     """Trained policies (.safetensors files) to compare besides, as they are."""
     dqn: DQNConfig = field(default_factory=DQNConfig.fast)
