@@ -25,8 +25,8 @@ lint: setup-dev
 
 setup: .venv/installed
 setup-dev: .venv/installed-dev
-# the independent tools, the browser driver and Ray, for the tests marked `check`, `browser` and `ray`; without them
-# those tests are skipped (the browser itself is a Debian package: chromium)
+# the independent tools, the browser driver, Ray and atheris, for the tests marked `check`, `browser`, `ray` and `fuzz`;
+# without them those tests are skipped (the browser itself is a Debian package: chromium)
 setup-check: .venv/installed-check
 
 # The stamps are written last, so an interrupted installation is done again.
@@ -44,7 +44,7 @@ setup-check: .venv/installed-check
 	touch $@
 
 .venv/installed-check: .venv/installed-dev
-	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e ".[dev,check,browser,ray]"
+	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e ".[dev,check,browser,ray,fuzz]"
 	touch $@
 
 clean:

@@ -125,7 +125,7 @@ def main() -> int:
         statistics = dict(re.findall(r"stat::(\w+):\s+(\d+)", done.stderr))
         covered = re.findall(r"cov: (\d+)", done.stderr) or ["0"]
         count = statistics.get("number_of_executed_units", "?")
-        verdict = "nothing found" if done.returncode == 0 else "FOUND: " + _finding(done.stderr)
+        verdict = "nothing found" if done.returncode == 0 else "FOUND: " + _finding(done.stdout + done.stderr)
         print(f"{loader.name:16} {count:>7} inputs, {covered[-1]:>5} branches covered: {verdict}", flush=True)
         found += done.returncode != 0
     return int(found > 0)
