@@ -83,8 +83,27 @@ def _sum(
                 for k in range(num_values):
                     memory[there + k] = weight * source[here + k]
         else:
-            # four values at a time in registers: several times faster than adding rows in memory
+            # eight or four values at a time in registers: several times faster than adding rows in memory
             k = 0
+            while k + 8 <= num_values:
+                at = out + k
+                a, b, c, d = memory[at], memory[at + 1], memory[at + 2], memory[at + 3]
+                e, f, g, h = memory[at + 4], memory[at + 5], memory[at + 6], memory[at + 7]
+                for digit in range(sizes[variable]):
+                    value = support[variable, digit]
+                    weight = scale * memory[belief + value] * memory[joint + joint_step * value]
+                    here = row + step * value + k
+                    a += weight * source[here]
+                    b += weight * source[here + 1]
+                    c += weight * source[here + 2]
+                    d += weight * source[here + 3]
+                    e += weight * source[here + 4]
+                    f += weight * source[here + 5]
+                    g += weight * source[here + 6]
+                    h += weight * source[here + 7]
+                memory[at], memory[at + 1], memory[at + 2], memory[at + 3] = a, b, c, d
+                memory[at + 4], memory[at + 5], memory[at + 6], memory[at + 7] = e, f, g, h
+                k += 8
             while k + 4 <= num_values:
                 a, b, c, d = memory[out + k], memory[out + k + 1], memory[out + k + 2], memory[out + k + 3]
                 for digit in range(sizes[variable]):
