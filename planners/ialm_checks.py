@@ -32,15 +32,15 @@ def check(model: IALM, num_variables: int) -> None:
         UserError: an array has a wrong type or shape, or points outside another; the message says which.
     """
     for name, table in model.tables.items():
-        _check_table(name, table, num_variables)
+        check_table(name, table, num_variables)
     if model.tables["influence"].moments.shape[1] != NUM_MOVES - 1:
         raise UserError(f"table 'influence' must tell {NUM_MOVES - 1} moves apart")
     _check_motion(model.motion)
     side = 2 * model.motion.window + 1
     n, k = model.num_factors, model.num_values
-    _check_array("leaf.values", model.leaf_values, "float64", (side, side, NUM_HEADINGS, None))
-    _check_array("codes", model.known_codes, "uint8", (None, n))
-    _check_array("initial.poses", model.initial_poses, "int16", (None, 3))
+    check_array("leaf.values", model.leaf_values, "float64", (side, side, NUM_HEADINGS, None))
+    check_array("codes", model.known_codes, "uint8", (None, n))
+    check_array("initial.poses", model.initial_poses, "int16", (None, 3))
     if (model.known_codes >= k).any():
         raise UserError(f"'codes' holds a value above {k - 1}")
     if not _headings(model.initial_poses[:, 2]):
@@ -57,11 +57,16 @@ def check(model: IALM, num_variables: int) -> None:
         raise UserError(f"a view of size {model.view_size} is none")
 
 
-def _check_table(name: str, table: DecisionTable, num_variables: int) -> None:
+def check_table(name: str, table: DecisionTable, num_variables: int) -> None:
+    """Check that a table asks about variables 0 to `num_variables` - 1, and that every walk through it ends.
+
+    Raises:
+        UserError: what is wrong with the table of that name.
+    """
     nodes = len(table.slot)
     for part, kind in _TABLE_TYPES:
-        _check_array(f"{name}.{part}", getattr(table, part), kind, (nodes,))
-    _check_array(f"{name}.moments", table.moments, "float64", (nodes, None))
+        check_array(f"{name}.{part}", getattr(table, part), kind, (nodes,))
+    check_array(f"{name}.moments", table.moments, "float64", (nodes, None))
     if table.kind not in ("distribution", "mean") or not table.moments.shape[1] <= _MOST_CLASSES:
         raise UserError(f"table '{name}' is neither a distribution nor a mean")
     if table.kind == "mean" and table.moments.shape[1] != 3:
@@ -79,9 +84,9 @@ def _check_table(name: str, table: DecisionTable, num_variables: int) -> None:
 
 def _check_motion(motion: RelativeMotion) -> None:
     shape = (NUM_MOTIONS, NUM_MOVES, NUM_HEADINGS)
-    _check_array("motion.coefficients", motion.coefficients, "int64", (*shape, 2, 3))
-    _check_array("motion.next_heading", motion.next_heading, "int64", shape)
-    _check_array("motion.counts", motion.counts, "int64", (*shape, 2))
+    check_array("motion.coefficients", motion.coefficients, "int64", (*shape, 2, 3))
+    check_array("motion.next_heading", motion.next_heading, "int64", shape)
+    check_array("motion.counts", motion.counts, "int64", (*shape, 2))
     if np.abs(motion.coefficients).max() > _FARTHEST or not _headings(motion.next_heading):
         raise UserError("'motion' leads to places or headings that there are not")
     if not 0 < motion.window <= 500:
@@ -92,7 +97,12 @@ def _headings(values: np.ndarray) -> bool:
     return bool(((values >= 0) & (values < NUM_HEADINGS)).all())
 
 
-def _check_array(name: str, array: np.ndarray, kind: str, shape: tuple[int | None, ...]) -> None:
+def check_array(name: str, array: np.ndarray, kind: str, shape: tuple[int | None, ...]) -> None:
+    """Check type and shape (None: any length above 0) of an array, and that its numbers are finite.
+
+    Raises:
+        UserError: what is wrong with the array of that name.
+    """
     fits = array.ndim == len(shape) and all(
         found > 0 and wanted in (None, found) for found, wanted in zip(array.shape, shape, strict=True)
     )

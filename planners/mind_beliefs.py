@@ -21,7 +21,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from planners.mind_walk import MindParticles
-from planners.minds import MAX_WALK
+from planners.minds import MAX_WALK, PERIOD
 from planners.motion import FORWARD, STAY
 from planners.scenes import AHEAD
 from planners.ways import CLOCK, GONE, HEADS_FOR, OWN, PLACE, SCENE, Node, Ways
@@ -156,7 +156,10 @@ class MindBelief:
         faced = int(scenes.follows[s, q, FORWARD])
         wall = int(action == FORWARD and faced == q)
         person = int(faced != q and scenes.cell[s, faced] == scenes.cell[s, node[PLACE]])
-        moved = float(self.model.moved_chance[min(node[CLOCK], self.model.horizon), action, wall, person])
+        t = node[CLOCK]
+        while t > self.model.horizon:
+            t -= PERIOD
+        moved = float(self.model.moved_chance[t, action, wall, person])
         return [(int(scenes.follows[s, q, action]), moved), (q, 1.0 - moved)]
 
     def _see(self, code: np.ndarray, pose: np.ndarray | None) -> float:

@@ -30,12 +30,15 @@ import numpy as np
 from nesy.errors import UserError
 from nesy.run_folder import atomic_path, read_json, write_json
 from planners.intentions import Intentions, ways_to
+from planners.mind_checks import check_minds
 from planners.motion import NUM_MOVES
 from planners.scenes import Scenes
 from planners.tables import DecisionTable, Parents
 
 PHASES = (2, 3, 4, 5, 6)
 """The clock is asked about as t modulo these."""
+PERIOD = 60
+"""After so many steps the clock looks the same."""
 MOVES = Parents(
     ("action", *(f"clock modulo {k}" for k in PHASES), "wall_ahead", "person_ahead"),
     tuple(range(3 + len(PHASES))),
@@ -178,7 +181,7 @@ class MindModel:
                 return DecisionTable(**parts, kind=str(kept["kind"]), names=names)
 
             scenes = {name.removeprefix("scenes."): a for name, a in arrays.items() if name.startswith("scenes.")}
-            return cls(
+            model = cls(
                 Scenes.from_arrays(scenes),
                 Intentions(table("ways"), arrays["counts"], arrays["prior"], arrays["vanish"], arrays["starts"]),
                 table("moved"),
@@ -189,6 +192,14 @@ class MindModel:
                 int(description["horizon"]),
                 dict(description["provenance"]),
             )
+            variables = {
+                "moved": len(MOVES.names),
+                "next_lost": 2,
+                "outcome": len(STEP.names),
+                "reward": len(STEP.names),
+            }
+            check_minds(model, variables)
+            return model
         except (OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, zipfile.BadZipFile, zlib.error):
             raise UserError(f"{path}: missing or damaged; learn the tables again (nesy compare)") from None
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from domains.core import GOAL
 from nesy.compiled import njit
-from planners.minds import MAX_STANDING, MAX_WALK, MindModel
+from planners.minds import MAX_STANDING, MAX_WALK, PERIOD, MindModel
 from planners.motion import FORWARD, NUM_MOVES, STAY
 
 if TYPE_CHECKING:
@@ -254,6 +254,8 @@ def moved_chance(ways: PackedWays, node: int, q: int, action: int) -> float:
     faced = ways.follows[s, q, FORWARD]
     wall = 1 if action == FORWARD and faced == q else 0
     person = 1 if faced != q and ways.cell[s, faced] == ways.cell[s, ways.node[node, 2]] else 0
+    while t >= ways.moved.shape[0]:
+        t -= PERIOD
     return ways.moved[t, action, wall, person]
 
 

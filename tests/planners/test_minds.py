@@ -419,6 +419,29 @@ def test_stored_models_are_the_same_and_damage_is_named(model: MindModel, tmp_pa
         MindModel.load(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("scenes.follows", 9999),
+        ("scenes.goals", 999),
+        ("scenes.cell", -5),
+        ("scenes.number", 9999),
+        ("starts", 10_000),
+        ("counts", -1),
+        ("outcome.yes", 10**6),
+        ("reward.slot", 77),
+    ],
+)
+def test_what_points_elsewhere_is_refused(name: str, value: int, model: MindModel, tmp_path: Path) -> None:
+    model.save(tmp_path)
+    with np.load(tmp_path / "minds.npz") as stored:
+        arrays = {key: stored[key].copy() for key in stored.files}
+    arrays[name].flat[0] = value
+    np.savez(tmp_path / "minds.npz", **arrays)
+    with pytest.raises(UserError):
+        MindModel.load(tmp_path)
+
+
 def test_several_goals_are_noticed(moving: tuple[Experience, MindModel]) -> None:
     experience = moving[0]
     assert several_goals(experience)
