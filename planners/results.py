@@ -5,7 +5,8 @@ episodes (all seeds pooled) -> records (means, interquartile means, intervals, r
 
 Intervals: stratified by map where maps come more than once, since every agent meets the same ones; where each comes
 once, of what is short of the optimum there, which is known exactly; for agents that learn, with three seeds or more,
-over seeds, since the episodes of one training have that training in common.
+over seeds, since the episodes of one training have that training in common. Shares of the optimum are of what it gets
+in the same episodes: on the same maps, or, where a map says too little (who knows which goal is meant), when it plays.
 """
 
 from __future__ import annotations
@@ -55,7 +56,11 @@ def write_results(
     from nesy.report.comparison_figures import save_figures
 
     played = _groups(episodes, "eval")
-    records = [_record(condition, rows, config, optima) for condition, rows in played.items()]
+    peers = {condition[3]: rows for condition, rows in played.items() if condition[0] == "optimum"}
+    records = [
+        _record(condition, rows, config, optima.get(condition[3]), peers.get(condition[3]))
+        for condition, rows in played.items()
+    ]
     regrets = [row for condition, rows in played.items() for row in _regrets(condition, rows, optima)]
     statistics = {
         "confidence": config.confidence,
@@ -140,21 +145,26 @@ def _interval(
 
 
 def _record(
-    condition: tuple[str, ...], rows: dict[str, np.ndarray], config: CompareConfig, optima: dict[str, Optimum | None]
+    condition: tuple[str, ...],
+    rows: dict[str, np.ndarray],
+    config: CompareConfig,
+    optimum: Optimum | None,
+    peer: dict[str, np.ndarray] | None,
 ) -> dict[str, Any]:
     returns, success = rows["return"], (rows["outcome"] == "success").astype(np.float64)
-    optimum = optima.get(rows["variant"][0])
-    mean_return = _interval(returns, rows, config, best=_best(rows, optimum, "return")).as_dict()
-    mean_success = _interval(success, rows, config, best=_best(rows, optimum, "success")).as_dict()
+    best = _best(rows, optimum, peer, "return")
+    mean_return = _interval(returns, rows, config, best=best).as_dict()
+    mean_success = _interval(success, rows, config, best=_best(rows, optimum, peer, "success")).as_dict()
+    reference = optimum and optimum["mean_return"] if best is None else float(best.mean())
     record: dict[str, Any] = dict(zip(CONDITION, (str(part) for part in condition), strict=True))
     if record["agent"] == "optimum" and optimum is not None:
         mean_return, mean_success = _exact(optimum["mean_return"]), _exact(optimum["success"])
+        reference = optimum["mean_return"]
     metrics = {
         name: float(np.nanmean(column))
         for name, column in rows.items()
         if name not in METRICS_OF_NO_EPISODE and column.dtype.kind in "fi" and not np.isnan(column.astype(float)).all()
     }
-    best = _best(rows, optimum, "return")
     return {
         **record,
         "seeds": [int(seed) for seed in np.unique(rows["seed"])],
@@ -164,7 +174,7 @@ def _record(
         "success": mean_success,
         "ms_per_decision": float(np.median(rows["ms_per_decision"])),
         "experience_steps": int(rows["experience_steps"].max()),
-        "share_of_optimum": None if optimum is None else mean_return["mean"] / optimum["mean_return"],
+        "share_of_optimum": mean_return["mean"] / reference if reference else None,
         "regret": None if best is None else _interval(best - returns, rows, config).as_dict(),
         "metrics": metrics,
     }
@@ -174,12 +184,28 @@ def _exact(value: float) -> dict[str, Any]:
     return {"mean": value, "low": None, "high": None}
 
 
-def _best(rows: dict[str, np.ndarray], optimum: Optimum | None, what: str) -> np.ndarray | None:
-    """What the exact optimum gets on the map of each episode; None where its maps are not known."""
-    known = {} if optimum is None else {entry["map_id"]: entry[what] for entry in optimum["maps"]}
-    if not known or not all(int(name) in known for name in rows["map_id"]):
+def _best(
+    rows: dict[str, np.ndarray], optimum: Optimum | None, peer: dict[str, np.ndarray] | None, what: str
+) -> np.ndarray | None:
+    """What the exact optimum gets in each episode: on its map, where that says enough, or else when it played the same.
+
+    None where neither is known. `what` is `return` or `success`; `peer` holds the optimum's episodes.
+    """
+    known = _by_map(rows, optimum)
+    if known is not None:
+        return np.array([known[int(name)][what] for name in rows["map_id"]], np.float64)
+    if peer is None:
         return None
-    return np.array([known[int(name)] for name in rows["map_id"]])
+    values = peer["return"] if what == "return" else peer["outcome"] == "success"
+    same = dict(zip(zip(peer["seed"], peer["episode"], strict=True), values, strict=True))
+    keys = list(zip(rows["seed"], rows["episode"], strict=True))
+    return np.array([same[key] for key in keys], np.float64) if all(key in same for key in keys) else None
+
+
+def _by_map(rows: dict[str, np.ndarray], optimum: Optimum | None) -> dict[int, dict[str, Any]] | None:
+    """The optimum's entry of each map; None where a map of these episodes has none."""
+    known = {} if optimum is None else {entry["map_id"]: entry for entry in optimum["maps"]}
+    return known if known and all(int(name) in known for name in rows["map_id"]) else None
 
 
 def _regrets(
@@ -187,7 +213,7 @@ def _regrets(
 ) -> list[dict[str, Any]]:
     """One row per map: what the condition got, and the optimum."""
     optimum = optima.get(rows["variant"][0])
-    if _best(rows, optimum, "return") is None or optimum is None:
+    if optimum is None or _by_map(rows, optimum) is None:
         return []
     found = []
     for entry in optimum["maps"]:

@@ -153,3 +153,19 @@ def test_agents_of_earlier_comparisons_can_be_asked_too(tiny_run: Path) -> None:
         find_cell(run, later, "greedy")
     with pytest.raises(UserError, match="there are none"):
         find_cell(RunFolder(tiny_run / "nowhere"), later, "dqn")
+
+
+def test_the_share_of_the_optimum_is_of_the_same_episodes_where_maps_say_too_little(tmp_path: Path) -> None:
+    """In `intent` the goal of each episode is drawn: some draws are luckier than the mean over all worlds."""
+    follower, optimum = compare(
+        RunFolder(tmp_path), CompareConfig(agents=("greedy-follower", "optimum"), variants=("intent",), episodes=42)
+    )
+    rows = pq.read_table(tmp_path / "results" / "episodes.parquet").to_pydict()
+    played = {
+        agent: np.mean([total for name, total in zip(rows["agent"], rows["return"], strict=True) if name == agent])
+        for agent in ("greedy-follower", "optimum")
+    }
+    assert played["optimum"] != pytest.approx(90.0)  # what the fixture has for the mean over all worlds
+    assert follower["share_of_optimum"] == pytest.approx(played["greedy-follower"] / played["optimum"])
+    assert follower["regret"]["mean"] == pytest.approx(played["optimum"] - played["greedy-follower"])
+    assert optimum["share_of_optimum"] == 1.0
