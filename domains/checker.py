@@ -98,6 +98,7 @@ def _check_state(env: BatchedEnvironment, domain: Domain, observation: dict[str,
     _array(env.person_views(), np.uint8, (count, width, width), f"{where}: person_views()")
     _array(env.relative_poses(), np.int16, (count, 3), f"{where}: relative_poses()")
     _array(env.person_actions(), np.int8, (count,), f"{where}: person_actions()")
+    _array(env.person_minds(), np.int16, (count, 2, 2), f"{where}: person_minds()")
     _array(env.counters(), np.int16, (count, 2), f"{where}: counters()")
     _array(env.map_ids(), np.int64, (count,), f"{where}: map_ids()")
     seen = configuration > 0

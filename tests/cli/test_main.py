@@ -15,6 +15,7 @@ import pytest
 
 from nesy.cli import configuration
 from nesy.cli.main import COMMANDS, main
+from nesy.cli.pipeline import base_config
 from nesy.errors import UserError
 
 
@@ -122,6 +123,15 @@ def test_configuration_that_is_not_json(content: bytes, tmp_path: Path) -> None:
     path.write_bytes(content)
     with pytest.raises(UserError, match=r"config\.json"):
         configuration.load(path)
+
+
+def test_a_run_on_another_variant_compares_on_it(tmp_path: Path) -> None:
+    arguments = ["--run", str(tmp_path), "--variant", "intent"]
+    config = base_config(arguments)
+    assert (config.variant, config.compare.variants) == ("intent", ("intent",))
+    assert base_config(arguments[:2]).compare.variants == ("paper",)
+    configuration.save(config, tmp_path / "config.json", {})
+    assert base_config(arguments[:2]) == config
 
 
 def test_numbers_may_be_written_as_integers(tmp_path: Path) -> None:

@@ -264,3 +264,18 @@ def test_episodes_keep_their_invariants(seed, size, actions):
             assert info["outcome"]
             break
         assert state["lost"] < 3
+
+
+def test_what_persons_have_in_mind_is_where_the_state_has_it():
+    env = load_domain().make("following", 12, variant="false_belief", seed=4)
+    env.reset()
+    mistaken = 0
+    for step in range(40):
+        for state, minds in zip(env.states(), env.person_minds(), strict=True):
+            x, y, heading = state["agent"]
+            fx, fy = [(1, 0), (0, 1), (-1, 0), (0, -1)][heading]
+            for (side, ahead), name in zip(minds.tolist(), ("believed_goal", "goal"), strict=True):
+                assert (x - side * fy + ahead * fx, y + side * fx + ahead * fy) == state[name]
+            mistaken += state["believed_goal"] != state["goal"]
+        env.step(np.arange(12) % 4 if step % 3 else env.expert_actions("follower"))
+    assert mistaken > 0
