@@ -20,10 +20,10 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from planners.frames import AHEAD
 from planners.mind_walk import MindParticles
 from planners.minds import MAX_WALK, PERIOD
 from planners.motion import FORWARD, STAY
-from planners.scenes import AHEAD
 from planners.ways import CLOCK, GONE, HEADS_FOR, OWN, PLACE, SCENE, Node, Ways
 
 Truth = tuple[tuple[int, int], tuple[int, int]]

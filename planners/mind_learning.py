@@ -8,11 +8,12 @@ import numpy as np
 
 from domains.core import GOAL, WALL
 from nesy.errors import UserError
+from planners.frames import Frame, learn_frame, reckon
 from planners.ialm import TIMEOUT, WAIT, Codec
 from planners.intentions import learn_intentions
 from planners.minds import MAX_STANDING, MAX_WALK, MOVES, STEP, MindModel, move_variables
 from planners.motion import FORWARD, STAY
-from planners.scenes import Frame, Scenes, learn_frame, learn_scenes, reckon
+from planners.scenes import Scenes, learn_scenes
 from planners.tables import DecisionTable, Parents, learn_distribution, learn_mean
 
 if TYPE_CHECKING:

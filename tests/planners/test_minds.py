@@ -15,6 +15,7 @@ from nesy.config import CollectConfig
 from nesy.errors import UserError
 from nesy.experience import Experience
 from planners.config import SearchConfig
+from planners.frames import learn_frame
 from planners.ialm_learning import joined
 from planners.mind_agent import MindSearch
 from planners.mind_beliefs import MindBelief
@@ -23,7 +24,7 @@ from planners.mind_walk import MindTree, mind_advance
 from planners.minds import MAX_WALK, MindModel
 from planners.motion import FORWARD, STAY
 from planners.random_bits import stream
-from planners.scenes import FAR, learn_frame
+from planners.scenes import FAR
 from planners.ways import CLOCK, GONE, HEADS_FOR, OWN, PLACE, SCENE, Node, Ways
 
 MAPS = 6
