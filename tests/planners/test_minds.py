@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from domains.core import GOAL, UNSEEN, WALL, load_domain
-from nesy.collection import collect, collect_following
-from nesy.config import CollectConfig
 from nesy.errors import UserError
 from nesy.experience import Experience
 from planners.config import SearchConfig
 from planners.frames import learn_frame
-from planners.ialm_learning import joined
 from planners.mind_agent import MindSearch
 from planners.mind_beliefs import MindBelief
 from planners.mind_learning import learn_minds, several_goals
@@ -25,34 +21,8 @@ from planners.minds import MAX_WALK, MindModel
 from planners.motion import FORWARD, STAY
 from planners.random_bits import stream
 from planners.scenes import FAR
-from planners.ways import CLOCK, GONE, HEADS_FOR, OWN, PLACE, SCENE, Node, Ways
-
-MAPS = 6
-
-
-class DigitCodec:
-    """A code is what a checksum of the view says: enough to tell views apart."""
-
-    num_values = 8
-
-    def codes(self, views: np.ndarray) -> np.ndarray:
-        flat = views.reshape(len(views), -1).astype(np.uint64)
-        sums = (flat * (np.arange(flat.shape[1], dtype=np.uint64) * np.uint64(2654435761) + np.uint64(97))).sum(1)
-        return (sums[:, None] >> np.arange(0, 32, 4, dtype=np.uint64) & np.uint64(7)).astype(np.uint8)
-
-
-CODEC: Any = DigitCodec()
-
-
-def experience_of(variant: str, folder: Path) -> Experience:
-    """A few hundred episodes on some maps."""
-    domain = load_domain("person_following")
-    config = CollectConfig(crossing_episodes=0, following_episodes=240)
-    collect(domain, config, folder / "walks", 3, variant=variant)
-    collect_following(domain, 3000, 0.3, folder / "practice", 3, variant=variant)
-    experience = joined(Experience.load(folder / "walks"), Experience.load(folder / "practice"))
-    maps = np.unique(experience.map_id[np.char.startswith(experience.source, "following")])[::7]
-    return experience.select(np.isin(experience.map_id, maps))
+from planners.ways import CLOCK, GONE, HEADS_FOR, OWN, PLACE, SCENE, Ways
+from tests.planners.mind_models import CODEC, MAPS, brute_force, experience_of, starts
 
 
 @pytest.fixture(scope="module")
@@ -70,15 +40,6 @@ def model(moving: tuple[Experience, MindModel]) -> MindModel:
 @pytest.fixture(scope="module")
 def ways(model: MindModel) -> Ways:
     return Ways(model, CODEC, 0.99)
-
-
-def starts(model: MindModel) -> list[Node]:
-    return [
-        (s, 0, p, k, k, -1, 0)
-        for s, p, _ in model.intentions.starts.tolist()
-        for k in range(2)
-        if model.scenes.goals[s, k] >= 0
-    ]
 
 
 def test_robots_that_rest_are_found_out(moving: tuple[Experience, MindModel]) -> None:
@@ -147,81 +108,6 @@ def test_intentions_are_found_without_being_logged(moving: tuple[Experience, Min
     sure = model.intentions.counts.max(-1)[rows] / model.intentions.counts.sum(-1)[rows]
     assert sure.mean() > 0.95  # persons' plans are deterministic given the goal
     assert model.policy[rows].sum(-1) == pytest.approx(1.0)
-
-
-def brute_force(
-    ways: Ways, model: MindModel, actions: list[int], seen: list[tuple[np.ndarray, np.ndarray | None]]
-) -> dict[tuple[int, int, int], float]:
-    """P(s, z, g | what was seen), by going through every course of events one by one."""
-    scenes, noise = model.scenes, max(model.code_noise, 1e-4)
-    found: dict[tuple[int, int, int], float] = {}
-
-    def sight(s: int, q: int, p: int) -> bool:
-        return bool(scenes.sees[s, q, scenes.cell[s, p]] and scenes.cell[s, q] != scenes.cell[s, p])
-
-    def likelihood(s: int, q: int, p: int, gone: int, k: int) -> float:
-        code, pose = seen[k]
-        if sight(s, q, p) != (pose is not None):
-            return 0.0
-        if pose is not None and tuple(scenes.relative(*map(np.array, ([s], [q], [p])))[0]) != tuple(pose):
-            return 0.0
-        view = scenes.view[s, q].copy()
-        for candidate, cell in enumerate(scenes.goals[s]):
-            covered = pose is not None and scenes.cell[s, p] == cell
-            if cell >= 0 and scenes.sees[s, q, cell] and (candidate == gone or covered):
-                vx, vy = scenes.place_in_view(np.array([s]), np.array([q]), np.array([cell]), 5)
-                view[vx[0], vy[0]] = 0
-        wrong = int((CODEC.codes(view[None])[0] != code).sum())
-        return float((1 - noise) ** (len(code) - wrong) * noise**wrong)
-
-    def walk(k: int, weight: float, s: int, q: int, p: int, z: int, g: int, gone: int, lost: int, stood: int) -> None:
-        weight *= likelihood(s, q, p, gone, k)
-        if weight <= 0.0:
-            return
-        if k == len(actions):
-            found[s, z, g] = found.get((s, z, g), 0.0) + weight
-            return
-        action = actions[k]
-        options = [(g, gone, 1.0)]
-        if gone < 0:
-            chance = model.vanish_chance(k, ways.seen(s, p, g))
-            options = [(g, gone, 1.0 - chance), (1 - g, g, chance)]
-        faced = scenes.follows[s, q, FORWARD]
-        person_ahead = faced != q and scenes.cell[s, faced] == scenes.cell[s, p]
-        wall = action == FORWARD and faced == q
-        moved = 1.0 if action == STAY else float(model.moved_chance[k, action, int(wall), int(person_ahead)])
-        for own, left, share in options:
-            for then, moves in ((int(scenes.follows[s, q, action]), moved), (q, 1.0 - moved)):
-                if moves == 0.0 or share == 0.0:
-                    continue
-                for u in range(4):
-                    there = int(scenes.follows[s, p, u]) if u != STAY else p
-                    heads = own if own != z and ways.seen(s, there, z) else z
-                    cell, person = scenes.cell[s, then], scenes.cell[s, there]
-                    length = min(int(scenes.walk[s, then, person]), MAX_WALK)
-                    home = scenes.goals[s, own]
-                    front = scenes.follows[s, then, FORWARD]
-                    standing = min(stood + 1, 8) if person == home else 0
-                    variables = (
-                        length,
-                        int(sight(s, then, there)),
-                        int(person == home),
-                        standing,
-                        lost,
-                        int(cell == home and then != q and action == FORWARD),
-                        int(action == FORWARD and front != then and scenes.cell[s, front] == person),
-                        int(cell == person),
-                    )
-                    goes_on = float(model.judgement[variables][1])
-                    after = int(model.lost_chance[length, lost].argmax())
-                    chance = weight * share * moves * float(model.policy[s, z, p, u]) * goes_on
-                    walk(k + 1, chance, s, then, there, heads, own, left, after, standing)
-
-    for s, p, count in model.intentions.starts.tolist():
-        for z in range(2):
-            walk(0, count * float(model.intentions.prior[s, z]), s, 0, p, z, z, -1, 0, 0)
-    total = sum(found.values())
-    return {key: weight / total for key, weight in found.items()}
 
 
 @pytest.mark.parametrize("seed", range(3))
