@@ -228,6 +228,9 @@ def _batch(loader: Loader, scratch: Path, numbers: range, seed: int, tally: Coun
 
 
 def _work(loader: Loader, scratch: Path, numbers: range, seed: int, sending: Any) -> None:
+    import torch
+
+    torch.set_num_threads(1)  # the threads of the process that was forked are not here, and would be waited for
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "files"
         canary = Path(folder) / "canary"

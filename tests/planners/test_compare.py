@@ -148,7 +148,7 @@ def test_an_oracle_out_of_reach_is_left_out_with_its_reason(tmp_path: Path) -> N
 def test_agents_of_earlier_comparisons_can_be_asked_too(tiny_run: Path) -> None:
     run, later = RunFolder(tiny_run), CompareConfig(agents=("random",))
     assert find_cell(run, later, "dqn").influence == "perspective-shift"
-    assert find_cell(run, later, "search-full-random").name == "search-full-random-paper-seed0"
+    assert find_cell(run, later, "pomdp-full-random").name == "pomdp-full-random-paper-seed0"
     with pytest.raises(UserError, match="no agent 'greedy' with values of its own; there are dqn-full-"):
         find_cell(run, later, "greedy")
     with pytest.raises(UserError, match="there are none"):
