@@ -4,7 +4,7 @@ episodes (all seeds pooled) -> records (means, interquartile means, intervals, r
                             -> comparison.parquet .csv .md .tex, regret.parquet .csv, statistics.json, plots
 
 Intervals: stratified by map where maps come more than once, since every agent meets the same ones; where each comes
-once, of what is short of the optimum there, which is known exactly; for agents that learn, with three seeds or more,
+once, of what the optimum there does not explain (a control variate); for agents that learn, with three seeds or more,
 over seeds, since the episodes of one training have that training in common. Shares of the optimum are of what it gets
 in the same episodes: on the same maps, or, where a map says too little (who knows which goal is meant), when it plays.
 """
@@ -140,8 +140,15 @@ def _interval(
         return stratified_bootstrap(values, rows["map_id"], 0, config.confidence, statistic)
     if best is None or robust:  # nothing to resample within a map
         return bootstrap(values, 0, config.confidence, statistic)
-    short = bootstrap(best - values, 0, config.confidence)
-    return Interval(float(values.mean()), float(best.mean()) - short.high, float(best.mean()) - short.low)
+    return bootstrap(values - _explained(values, best), 0, config.confidence)
+
+
+def _explained(values: np.ndarray, best: np.ndarray) -> np.ndarray:
+    """What of each episode's value is due to its map: a control variate, the optimum there, whose mean is known."""
+    deviation = best - best.mean()
+    spread = float(deviation @ deviation)
+    slope = np.clip(deviation @ values / spread, 0.0, 1.0) if spread else 0.0
+    return np.asarray(slope * deviation)
 
 
 def _record(
