@@ -81,7 +81,8 @@ def show(result: dict[str, Any]) -> None:
     """Print one table of everything measured."""
     table = Table(title="speeds on one core, each beside a named peer in the same run", title_justify="left")
     for column in ("suite", "what", "figure", "unit", "ratio", "peer"):
-        table.add_column(column, justify="right" if column in ("figure", "ratio") else "left", no_wrap=True)
+        number = column in ("figure", "ratio")
+        table.add_column(column, justify="right" if number else "left", no_wrap=column not in ("what", "peer"))
     for suite, rows in result["suites"].items():
         for row in rows:
             figure, ratio = _short(row["figure"]), f"{row['ratio']:.3g} x"

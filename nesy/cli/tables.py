@@ -24,7 +24,9 @@ def print_comparison(cells: list[dict[str, Any]]) -> None:
 def print_wide(table: Table) -> None:
     """Print a table on standard output; wide enough for every cell where that is not a terminal."""
     console = Console(file=sys.stdout)
-    (console if console.is_terminal else Console(file=sys.stdout, width=160)).print(table)
+    if not console.is_terminal:
+        console = Console(file=sys.stdout, width=Console(width=10_000).measure(table).maximum)
+    console.print(table)
 
 
 def print_figures(title: str, figures: dict[str, Any]) -> None:
