@@ -10,6 +10,10 @@ from typing import Any
 from nesy.report.text import flat, number
 
 
+SHORT_CAPTION = 90
+"""Letters of a caption that may be wider than its table; a longer one is broken into lines."""
+
+
 def table(columns: Sequence[str], rows: Iterable[Sequence[str]], caption: str, text_columns: int = 1) -> str:
     """A table; its first `text_columns` columns are text, the others numbers. Everything in it is escaped."""
 
@@ -18,8 +22,9 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[str]], caption: str, t
         return "".join(f"<{tag}{kind}>{html.escape(value)}</{tag}>" for kind, value in zip(kinds, values, strict=True))
 
     body = "\n".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
+    length = ' class="short"' if len(caption) <= SHORT_CAPTION else ""
     return (
-        f'<div class="scroll"><table><caption>{html.escape(caption)}</caption>'
+        f'<div class="scroll"><table><caption{length}>{html.escape(caption)}</caption>'
         f"<thead><tr>{cells('th', columns)}</tr></thead><tbody>\n{body}\n</tbody></table></div>"
     )
 
