@@ -9,7 +9,6 @@ from typing import Any
 
 from nesy.report.text import flat, number
 
-
 SHORT_CAPTION = 90
 """Letters of a caption that may be wider than its table; a longer one is broken into lines."""
 
