@@ -5,7 +5,8 @@ percepts (x, b, b~, configuration), the last actions  ->  actions [B]
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -68,18 +69,17 @@ class Planner(Protocol):
         ...
 
 
-class PlanningAgent:
-    """Keeps a particle belief per episode and plans in it with pomdp-py's POUCT, QMDP or our own search.
+class BeliefAgent:
+    """Keeps a belief per episode and plans in it; what both are, and what a belief is told, its kinds say.
 
     Every episode has random streams of its own, so results do not depend on which episodes run side by side.
     """
 
-    def __init__(self, kind: str, model: IALM, config: SearchConfig, geometry: ViewGeometry, seed: int) -> None:
-        self.kind, self.model, self.config, self.geometry, self.seed = kind, model, config, geometry, seed
-        self.compiled = compile_model(model)
-        self.beliefs: list[ParticleBelief] = []
-        self.planners: list[Planner] = []
-        self.infos: list[dict[str, object]] = []
+    def __init__(self, geometry: ViewGeometry, seed: int) -> None:
+        self.geometry, self.seed = geometry, seed
+        self.beliefs: list[Any] = []
+        self.planners: list[Any] = []
+        self.infos: list[dict[str, Any]] = []
 
     def actions(self, situation: Situation) -> np.ndarray:
         """Update the beliefs of the active episodes and plan in each."""
@@ -91,13 +91,14 @@ class PlanningAgent:
         actions = np.zeros(count, np.int64)
         self.infos = [{} for _ in range(count)]
         poses = self.geometry.relative(percepts.configurations)
-        for i in np.flatnonzero(situation.active):
+        told = self._told(situation)
+        for i in np.flatnonzero(situation.active).tolist():
             pose = poses[i] if percepts.configurations[i] > 0 else None
             belief = self.beliefs[i]
             if situation.last_actions is None:
-                belief.reset(percepts.codes[i], pose, percepts.shifted[i])
+                belief.reset(percepts.codes[i], pose, told[i])
             else:
-                belief.update(int(situation.last_actions[i]), percepts.codes[i], pose, percepts.shifted[i])
+                belief.update(int(situation.last_actions[i]), percepts.codes[i], pose, told[i])
             allowed = None if situation.allowed is None else situation.allowed[i]
             actions[i], info = self.planners[i].plan(belief.states, allowed)
             self.infos[i] = info | {"effective": belief.effective, "resets": belief.resets}
@@ -109,8 +110,34 @@ class PlanningAgent:
             filtering, planning = (
                 np.random.default_rng(child) for child in np.random.SeedSequence([self.seed, i]).spawn(2)
             )
-            self.beliefs.append(ParticleBelief(self.model, self.compiled, self.config.particles, filtering))
+            self.beliefs.append(self._belief(filtering))
             self.planners.append(self._planner(planning))
+
+    def _told(self, situation: Situation) -> Sequence[Any] | np.ndarray:
+        """What the belief of each episode is told besides code and pose."""
+        raise NotImplementedError
+
+    def _belief(self, rng: np.random.Generator) -> Any:
+        raise NotImplementedError
+
+    def _planner(self, rng: np.random.Generator) -> Any:
+        raise NotImplementedError
+
+
+class PlanningAgent(BeliefAgent):
+    """Keeps particles of the local model and plans with pomdp-py's POUCT, QMDP or our own search."""
+
+    def __init__(self, kind: str, model: IALM, config: SearchConfig, geometry: ViewGeometry, seed: int) -> None:
+        super().__init__(geometry, seed)
+        self.kind, self.model, self.config = kind, model, config
+        self.compiled = compile_model(model)
+
+    def _told(self, situation: Situation) -> np.ndarray:
+        assert situation.percepts is not None
+        return situation.percepts.shifted
+
+    def _belief(self, rng: np.random.Generator) -> ParticleBelief:
+        return ParticleBelief(self.model, self.compiled, self.config.particles, rng)
 
     def _planner(self, rng: np.random.Generator) -> Planner:
         if self.kind == "pomdp":

@@ -5,12 +5,13 @@ percepts (x, c)  ->  belief over (scene, stations, z, g)  ->  search  ->  action
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from domains.core import ViewGeometry
-from planners.agents import Situation
+from planners.agents import BeliefAgent, Situation
 from planners.config import SearchConfig
 from planners.mind_beliefs import MindBelief, Truth
 from planners.mind_walk import KEYS, MindParticles, MindTree
@@ -74,50 +75,24 @@ class MindSearch:
         return f"code {code}: {in_words(int(offset @ scenes.side[heading]), int(offset @ scenes.ahead[heading]))}"
 
 
-class MindAgent:
-    """Plays episodes side by side, each with a belief and random streams of its own."""
+class MindAgent(BeliefAgent):
+    """Keeps an exact belief over what the person has in mind, and searches in it."""
 
     def __init__(
         self, model: MindModel, codec: Codec, influence: str, config: SearchConfig, geometry: ViewGeometry, seed: int
     ) -> None:
-        self.influence, self.config, self.geometry, self.seed = influence, config, geometry, seed
+        super().__init__(geometry, seed)
+        self.influence, self.config = influence, config
         slack = SLACK if influence == "egocentric" else None
         self.ways = Ways(model, codec, config.mind_discount, slack)
-        self.beliefs: list[MindBelief] = []
-        self.planners: list[MindSearch] = []
-        self.infos: list[dict[str, Any]] = []
 
-    def actions(self, situation: Situation) -> np.ndarray:
-        """Update the beliefs of the active episodes and plan in each."""
-        percepts = situation.percepts
-        assert percepts is not None
-        count = len(situation.active)
-        if situation.last_actions is None:
-            self._begin(count)
-        actions = np.zeros(count, np.int64)
-        self.infos = [{} for _ in range(count)]
-        poses = self.geometry.relative(percepts.configurations)
-        minds = situation.env.person_minds() if self.influence == "perfect-information" else None
-        for i in np.flatnonzero(situation.active):
-            pose = poses[i] if percepts.configurations[i] > 0 else None
-            truth: Truth | None = None
-            if minds is not None:
-                truth = tuple(tuple(int(v) for v in place) for place in minds[i])  # type: ignore[assignment]
-            belief = self.beliefs[i]
-            if situation.last_actions is None:
-                belief.reset(percepts.codes[i], pose, truth)
-            else:
-                belief.update(int(situation.last_actions[i]), percepts.codes[i], pose, truth)
-            allowed = None if situation.allowed is None else situation.allowed[i]
-            actions[i], info = self.planners[i].plan(belief.particles(), allowed)
-            self.infos[i] = info | {"effective": float(len(belief.weights)), "resets": belief.resets}
-        return actions
+    def _told(self, situation: Situation) -> Sequence[Truth | None]:
+        if self.influence != "perfect-information":
+            return [None] * len(situation.active)
+        return [((mind[0][0], mind[0][1]), (mind[1][0], mind[1][1])) for mind in situation.env.person_minds().tolist()]
 
-    def _begin(self, count: int) -> None:
-        self.beliefs, self.planners = [], []
-        for i in range(count):
-            filtering, planning = (
-                np.random.default_rng(child) for child in np.random.SeedSequence([self.seed, i]).spawn(2)
-            )
-            self.beliefs.append(MindBelief(self.ways, self.influence, filtering))
-            self.planners.append(MindSearch(self.ways, self.config, planning))
+    def _belief(self, rng: np.random.Generator) -> MindBelief:
+        return MindBelief(self.ways, self.influence, rng)
+
+    def _planner(self, rng: np.random.Generator) -> MindSearch:
+        return MindSearch(self.ways, self.config, rng)

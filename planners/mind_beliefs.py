@@ -106,7 +106,13 @@ class MindBelief:
         self._mind(truth)
         return likelihood
 
-    def particles(self) -> MindParticles:
+    @property
+    def effective(self) -> float:
+        """How many hypotheses there are."""
+        return float(len(self.weights))
+
+    @property
+    def states(self) -> MindParticles:
         """The belief for a search."""
         nodes = self.ways.numbers([node for node, _, _ in self.weights])
         weights = np.array(list(self.weights.values()))

@@ -8,7 +8,7 @@ import numpy as np
 
 from nesy.compiled import njit
 from planners.motion import STAY
-from planners.random_bits import uniform
+from planners.random_bits import drawn, uniform
 from planners.ways import PackedWays, feature, moved_chance
 
 KEYS = 1 << 20
@@ -44,15 +44,8 @@ def mind_room(model: MindTree) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def mind_begin(model: MindTree, belief: MindParticles, state: np.ndarray, bits: np.ndarray) -> bool:
     """Draw a hypothesis."""
-    number = uniform(bits)
-    low, high = 0, belief.cumulative.shape[0] - 1
-    while low < high:
-        half = (low + high) // 2
-        if number < belief.cumulative[half]:
-            high = half
-        else:
-            low = half + 1
-    state[0], state[1], state[2] = belief.node[low], belief.station[low], belief.lost[low]
+    i = drawn(belief.cumulative, bits)
+    state[0], state[1], state[2] = belief.node[i], belief.station[i], belief.lost[i]
     return True
 
 

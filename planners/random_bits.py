@@ -31,3 +31,17 @@ def uniform(state: np.ndarray) -> float:
     z = (z ^ (z >> _S27)) * _MIX_2
     z = z ^ (z >> _S31)
     return np.float64(z >> _S11) * (1.0 / 9007199254740992.0)
+
+
+@njit(cache=True)
+def drawn(cumulative: np.ndarray, state: np.ndarray) -> int:
+    """A position drawn from its cumulative distribution, float64 [n], by bisection."""
+    number = uniform(state)
+    low, high = 0, cumulative.shape[0] - 1
+    while low < high:
+        half = (low + high) // 2
+        if number < cumulative[half]:
+            high = half
+        else:
+            low = half + 1
+    return low

@@ -25,7 +25,7 @@ from domains.core import Domain, load_domain
 from nesy.errors import UserError
 from nesy.progress import SILENT, Progress
 from nesy.run_folder import RunFolder, atomic_path, read_json
-from planners.agents import Agent
+from planners.agents import Agent, BeliefAgent
 from planners.cells import cell_seed, restored_player
 from planners.compare import EVALUATION_SEED, Cell, grid
 from planners.config import CompareConfig
@@ -268,10 +268,9 @@ def _thoughts(agent: Agent, percepts: Percepts, i: int) -> dict[str, Any]:
     if hasattr(policy, "values"):
         one = Percepts(*(part[i : i + 1] for part in percepts))
         return {"q": [round(float(value), 3) for value in policy.values(one)[0]]}
-    infos, planners = getattr(agent, "infos", None), getattr(agent, "planners", None)
-    if not infos or not planners:
+    if not isinstance(agent, BeliefAgent):
         return {}
-    info, planner, belief = infos[i], planners[i], agent.beliefs[i]  # type: ignore[attr-defined]
+    info, planner, belief = agent.infos[i], agent.planners[i], agent.beliefs[i]
     plan: dict[str, Any] = {
         "values": [round(float(value), 3) for value in info["values"]],
         "visits": [int(count) for count in info["visits"]],

@@ -24,7 +24,7 @@ from planners.code_sampling import CodeSampler, next_code
 from planners.ialm import SCALARS
 from planners.kernels import Model, step
 from planners.mind_walk import mind_advance, mind_begin, mind_room
-from planners.random_bits import uniform
+from planners.random_bits import drawn, uniform
 from planners.tree import NO_CHILD, Tree, backup, backup_best, best_by_ucb, find_child
 
 
@@ -90,15 +90,7 @@ def _tabular_room(model: PackedPOMDP) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 def _tabular_begin(model: PackedPOMDP, belief: TabularBelief, state: np.ndarray, bits: np.ndarray) -> bool:
-    number = uniform(bits)
-    low, high = 0, belief.support.shape[0] - 1
-    while low < high:
-        half = (low + high) // 2
-        if number < belief.cumulative[half]:
-            high = half
-        else:
-            low = half + 1
-    state[0] = belief.support[low]
+    state[0] = belief.support[drawn(belief.cumulative, bits)]
     return not model.terminal[state[0]]
 
 

@@ -270,15 +270,13 @@ def test_the_search_is_worth_its_leaves_where_all_is_known(model: MindModel, way
     node = starts(model)[0]
     belief.weights = {(node, 0, 0): 1.0}
     search = MindSearch(ways, SearchConfig(simulations=400, mind_depth=6), np.random.default_rng(0))
-    action, info = search.plan(belief.particles())
+    action, info = search.plan(belief.states)
     value = float(ways.packed.value[ways.numbers([node])[0], 0, 0])
     assert info["values"][action] <= value + 0.05 * abs(value) + 0.1
     assert info["values"][action] > value - 0.3 * abs(value) - 0.5
-    masked, _ = search.plan(belief.particles(), np.arange(4) == (action + 1) % 4)
+    masked, _ = search.plan(belief.states, np.arange(4) == (action + 1) % 4)
     assert masked == (action + 1) % 4
-    again = MindSearch(ways, SearchConfig(simulations=400, mind_depth=6), np.random.default_rng(0)).plan(
-        belief.particles()
-    )
+    again = MindSearch(ways, SearchConfig(simulations=400, mind_depth=6), np.random.default_rng(0)).plan(belief.states)
     assert again[1]["values"] == info["values"]
     seen = int(search.tree.key[search.tree.owner >= 0][0])
     assert search.describe(seen).startswith("code ")
