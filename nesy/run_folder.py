@@ -68,7 +68,7 @@ def read_json(path: Path) -> Any:
         raise UserError(f"{path}: not valid JSON ({error})") from None
 
 
-def parse_json(text: str) -> Any:
+def parse_json(text: str | bytes) -> Any:
     """JSON as we write it: whole numbers of at most 64 bits, no NaN or Infinity.
 
     Raises:

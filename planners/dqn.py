@@ -28,7 +28,7 @@ from torch import nn
 from domains.core import OUTCOMES, Domain
 from nesy.errors import UserError
 from nesy.progress import SILENT, Progress
-from nesy.run_folder import atomic_path
+from nesy.run_folder import atomic_path, parse_json
 from planners.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from planners.config import DQNConfig
 from planners.memory import Replay, distinct
@@ -132,13 +132,13 @@ class DQNPolicy:
 
         try:
             with safe_open(str(path), framework="pt") as stored:
-                metadata = json.loads((stored.metadata() or {})["policy"])
+                metadata = parse_json((stored.metadata() or {})["policy"])
                 weights = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
-            values = json.loads(metadata["config"])
+            values = parse_json(metadata["config"])
             config = DQNConfig(**{**values, "hidden": tuple(values["hidden"])})
             network = ValueNetwork(int(metadata["num_inputs"]), int(metadata["num_actions"]), config)
             network.load_state_dict(weights)
-            trained = json.loads(metadata.get("trained", "{}"))
+            trained = parse_json(metadata.get("trained", "{}"))
             return cls(network, metadata["inputs"], int(metadata["num_configurations"]), config, trained)
         except FileNotFoundError:
             raise UserError(f"{path}: no such policy; train it with: nesy compare") from None

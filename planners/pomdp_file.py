@@ -180,6 +180,8 @@ class _Reader:
                 if int(words[0]) > _MOST_NAMES:
                     raise self.fail(f"{words[0]} {keyword} are too many")
                 words = [str(i) for i in range(int(words[0]))]
+            if not words:
+                raise self.fail(f"'{keyword}:' names nothing; at least one is needed")
             if len(set(words)) != len(words):
                 raise self.fail(f"a name occurs twice in '{keyword}:'")
             self.names[keyword] = words

@@ -29,10 +29,13 @@ def mutate(path: Path, content: bytes, rng: np.random.Generator, canary: Path) -
     ]
     if path.suffix in (".json", ".jgum"):
         kinds += [("json", lambda: _json(path, content, rng))] * 4
+    if path.suffix == ".jgum":
+        kinds += [("model", lambda: _jgum(content, rng))] * 4
     if path.suffix == ".npz":
         kinds += [("array", lambda: _npz(content, rng))] * 3
     if path.suffix == ".parquet":
         kinds += [("column", lambda: _column(content, rng))] * 3
+        kinds += [("metadata", lambda: _metadata(content, rng))] * 3
     if path.suffix == ".safetensors":
         kinds += [("header", lambda: _header(content, rng))] * 3
     if path.suffix in (".lp", ".pomdp"):
@@ -174,6 +177,41 @@ def _column(content: bytes, rng: np.random.Generator) -> bytes:
         table = table.slice(0, int(rng.integers(table.num_rows)))
     buffer = io.BytesIO()
     pq.write_table(table, buffer)
+    return buffer.getvalue()
+
+
+def _jgum(content: bytes, rng: np.random.Generator) -> bytes:
+    """A jgum file with one value of its network or of its description replaced, under a checksum that fits."""
+    from nesy.formats import jgum
+
+    document = json.loads(content)
+    properties = document["properties"]
+    if rng.random() < 0.7:
+        properties[jgum.PROPERTY] = _json(Path("x.json"), properties[jgum.PROPERTY].encode(), rng).decode()
+    else:
+        document = json.loads(_json(Path("x.json"), content, rng))
+        document.setdefault("properties", properties)
+    return jgum.sealed(json.dumps(document).encode())
+
+
+def _metadata(content: bytes, rng: np.random.Generator) -> bytes:
+    """A Parquet file with one value of its description replaced, under a checksum that fits."""
+    import pyarrow.parquet as pq
+
+    from nesy.formats import parquet
+
+    table = pq.read_table(io.BytesIO(content))
+    metadata = dict(table.schema.metadata or {})
+    if parquet.KEY in metadata:
+        metadata[parquet.KEY] = text = _json(Path("x.json"), metadata[parquet.KEY], rng)
+        k = json.loads(text).get("num_values")
+        if type(k) is int and k > 0 and table.num_rows % k == 0:
+            probabilities, counts = (table[name].to_numpy().reshape(-1, k) for name in ("probability", "count"))
+            metadata[parquet.SUM] = parquet.digest(text, probabilities, counts[:, 0]).encode()
+    else:
+        metadata[b"" if rng.random() < 0.1 else b"nesy"] = b"\xff"
+    buffer = io.BytesIO()
+    pq.write_table(table.replace_schema_metadata(metadata or {b"x": b""}), buffer)
     return buffer.getvalue()
 
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
+import pytest
 
 from domains.core import UNSEEN, load_domain
+from nesy.errors import UserError
 
 
 def test_a_crossing_step_tells_of_no_person() -> None:
@@ -29,3 +33,39 @@ def test_the_last_seen_follower_keeps_the_person_in_view() -> None:
     domain = load_domain()
     result = evaluate(domain, "paper", Player(LastSeenFollower(domain, "paper")), 42, seed=5)
     assert result["return"].mean() > 88
+
+
+def test_a_pomdp_file_without_states_is_refused(tmp_path: Path) -> None:
+    """`states:` with no name after it divided by zero at `start: uniform`."""
+    from planners.pomdp import TabularPOMDP
+
+    path = tmp_path / "empty.pomdp"
+    path.write_text("discount: 0.9\nvalues: reward\nstates:\nactions: a\nobservations: o\nstart: uniform\n")
+    with pytest.raises(UserError, match="'states:' names nothing"):
+        TabularPOMDP.from_file(path)
+
+
+def test_a_message_never_repeats_a_whole_file() -> None:
+    """A stranger's list of a thousand parents was repeated in full."""
+    message = str(UserError(f"model.json: {[0] * 5000} are not distinct factors"))
+    assert len(message) <= 1000
+    assert message.startswith("model.json: ")
+    assert message.endswith("are not distinct factors")
+
+
+def test_numbers_too_large_for_a_table_are_refused(tmp_path: Path) -> None:
+    """A number of 400 digits in the description beside the columns ended in an OverflowError."""
+    import pyarrow.parquet as pq
+
+    from nesy.dbn import TwoSliceDBN
+    from nesy.formats import export, parquet, read
+
+    dbn = TwoSliceDBN.from_tables([[np.full((2, 2), 0.5)]], [[(0,)]])
+    path = tmp_path / "model.parquet"
+    export(dbn, path)
+    table = pq.read_table(path)
+    text = table.schema.metadata[parquet.KEY].replace(b'"initial": [[0.5', b'"initial": [[' + b"9" * 400)
+    sha = parquet.digest(text, dbn.probabilities, dbn.row_counts).encode()
+    pq.write_table(table.replace_schema_metadata({parquet.KEY: text, parquet.SUM: sha}), path)
+    with pytest.raises(UserError, match="too large for a whole number"):
+        read(path)

@@ -17,10 +17,11 @@ from nesy.dbn.model import TwoSliceDBN
 from nesy.dbn.step_tables import StepTable
 from nesy.errors import UserError
 from nesy.formats.bayes_nodes import node_names, nodes
-from nesy.run_folder import atomic_path, read_json
+from nesy.run_folder import atomic_path, parse_json, read_json
 
 PROPERTY = "nesy-2dbn"
 SEAL, END = ', "sha256": "', '"}}\n'
+MOST_VALUES = 10_000
 
 
 def write(dbn: TwoSliceDBN, path: Path) -> None:
@@ -73,7 +74,7 @@ def read(path: Path) -> TwoSliceDBN:
     """
     content = read_json(path)
     try:
-        document = json.loads(content["properties"][PROPERTY])
+        document = parse_json(content["properties"][PROPERTY])
     except (KeyError, TypeError, ValueError, RecursionError):
         raise UserError(f"{path}: not a jgum file of a 2DBN (its property '{PROPERTY}' is missing)") from None
     _check_seal(path)
@@ -87,14 +88,21 @@ def read(path: Path) -> TwoSliceDBN:
 
 def _check_seal(path: Path) -> None:
     content = path.read_bytes()
-    place = content.rfind(SEAL.encode()) + len(SEAL)
-    if hashlib.sha256(content[:place]).hexdigest() + END != content[place:].decode("utf-8", "replace"):
+    if sealed(content) != content:
         raise UserError(f"{path}: damaged (its checksum does not match its content); export the model again")
+
+
+def sealed(content: bytes) -> bytes:
+    """The file's bytes with the checksum that belongs to what is before it."""
+    head = content[: content.rfind(SEAL.encode()) + len(SEAL)]
+    return head + (hashlib.sha256(head).hexdigest() + END).encode()
 
 
 def _build(document: dict[str, Any], content: dict[str, Any]) -> TwoSliceDBN:
     # an empty shell first: it checks the structure before any table is looked for
     k = int(document["num_values"])
+    if not 1 <= k <= MOST_VALUES:
+        raise UserError(f"{k} values per factor; 1 to {MOST_VALUES} can be read")
     now, later = _tuples(document["parents_now"]), _tuples(document["parents_next"])
     factors, actions = _tuples(document["factor_names"]), _tuples(document["action_names"])
     tables: list[list[np.ndarray]] = []

@@ -21,7 +21,7 @@ from nesy.dbn.model import TwoSliceDBN
 from nesy.dbn.step_tables import StepTable
 from nesy.errors import UserError
 from nesy.formats.long_table import Part, parts
-from nesy.run_folder import atomic_path
+from nesy.run_folder import atomic_path, parse_json
 
 KEY, SUM = b"nesy-2dbn", b"nesy-2dbn-sha256"
 _DAMAGE = (pa.ArrowException, OSError, ValueError, KeyError, TypeError, RecursionError, IndexError, AttributeError)
@@ -37,17 +37,18 @@ def write(dbn: TwoSliceDBN, path: Path) -> None:
     }
     document["step_tables"] = {name: table.plain() for name, table in dbn.step_tables.items()}
     text = json.dumps(document).encode()
-    schema = _schema(dbn).with_metadata({KEY: text, SUM: _digest(text, dbn.probabilities, dbn.row_counts).encode()})
+    schema = _schema(dbn).with_metadata({KEY: text, SUM: digest(text, dbn.probabilities, dbn.row_counts).encode()})
     with atomic_path(path) as temporary, pq.ParquetWriter(temporary, schema, compression="zstd") as writer:
         for part in parts(dbn):
             writer.write_table(_table(dbn, part, schema))
 
 
-def _digest(text: bytes, probabilities: np.ndarray, counts: np.ndarray) -> str:
-    digest = hashlib.sha256(text)
+def digest(text: bytes, probabilities: np.ndarray, counts: np.ndarray) -> str:
+    """SHA-256 of a model: the JSON beside its rows, their probabilities and counts."""
+    sha = hashlib.sha256(text)
     for array in (probabilities, counts):
-        digest.update(np.ascontiguousarray(array).view(np.uint8).reshape(-1).data)
-    return digest.hexdigest()
+        sha.update(np.ascontiguousarray(array).view(np.uint8).reshape(-1).data)
+    return sha.hexdigest()
 
 
 def _schema(dbn: TwoSliceDBN) -> pa.Schema:
@@ -101,23 +102,14 @@ def read(path: Path) -> TwoSliceDBN:
         metadata = table.schema.metadata or {}
         if KEY not in metadata:
             raise UserError(f"{path}: a Parquet file, but not of a 2DBN (metadata '{KEY.decode()}' is missing)")
-        document = json.loads(metadata[KEY])
+        document = parse_json(metadata[KEY])
         dbn = _build(document, table)
-        if _digest(metadata[KEY], dbn.probabilities, dbn.row_counts).encode() != metadata.get(SUM):
+        if digest(metadata[KEY], dbn.probabilities, dbn.row_counts).encode() != metadata.get(SUM):
             raise UserError(f"{path}: damaged (its checksum does not match its content); export the model again")
         _check_keys(dbn, table, path)
     except UserError as error:
         raise UserError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
-    except (
-        pa.ArrowException,
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        RecursionError,
-        IndexError,
-        AttributeError,
-    ) as error:
+    except _DAMAGE as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(f"{path}: not a readable Parquet file of a 2DBN ({reason})") from None
     return dbn
