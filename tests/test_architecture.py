@@ -37,7 +37,7 @@ def _files() -> list[Path]:
 
 def _layer(path: Path) -> str:
     relative = path.relative_to(ROOT).as_posix()
-    return "nesy/cli" if relative.startswith("nesy/cli/") else relative.split("/")[0]
+    return "nesy/cli" if relative.startswith(("nesy/cli/", "nesy/__main__.py")) else relative.split("/")[0]
 
 
 @pytest.mark.parametrize("path", _files(), ids=lambda path: path.relative_to(ROOT).as_posix())
