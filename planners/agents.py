@@ -5,6 +5,7 @@ percepts (x, b, b~, configuration), the last actions  ->  actions [B]
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
@@ -31,6 +32,7 @@ class Situation(NamedTuple):
         active: bool [B], where the episode still goes on; actions elsewhere are ignored.
         last_actions: int64 [B], what was done before; None at the start of the episodes.
         allowed: bool [B, A], what the rules allow, at least one action each; None without rules.
+        begun: `time.perf_counter()` when the decision began; None where nobody asks how long it takes.
     """
 
     env: BatchedEnvironment
@@ -39,6 +41,7 @@ class Situation(NamedTuple):
     active: np.ndarray
     last_actions: np.ndarray | None
     allowed: np.ndarray | None = None
+    begun: float | None = None
 
 
 class Agent(Protocol):
@@ -64,8 +67,13 @@ class DQNAgent:
 class Planner(Protocol):
     """Chooses an action for a belief, int16 [P, 2N + 5]."""
 
-    def plan(self, belief: np.ndarray, allowed: np.ndarray | None = None) -> tuple[int, dict[str, object]]:
-        """The action among those `allowed`, bool [A] (all by default), and what the search saw."""
+    def plan(
+        self, belief: np.ndarray, allowed: np.ndarray | None = None, spent: float = 0.0
+    ) -> tuple[int, dict[str, object]]:
+        """The action among those `allowed`, bool [A] (all by default), and what the search saw.
+
+        `spent`: seconds that the decision has taken already, which a limit of time counts.
+        """
         ...
 
 
@@ -85,6 +93,7 @@ class BeliefAgent:
         """Update the beliefs of the active episodes and plan in each."""
         percepts = situation.percepts
         assert percepts is not None
+        begun = time.perf_counter() if situation.begun is None else situation.begun
         count = len(situation.active)
         if situation.last_actions is None:
             self._begin(count)
@@ -92,15 +101,18 @@ class BeliefAgent:
         self.infos = [{} for _ in range(count)]
         poses = self.geometry.relative(percepts.configurations)
         told = self._told(situation)
+        shared = (time.perf_counter() - begun) / max(int(situation.active.sum()), 1)
         for i in np.flatnonzero(situation.active).tolist():
             pose = poses[i] if percepts.configurations[i] > 0 else None
             belief = self.beliefs[i]
+            begun = time.perf_counter()
             if situation.last_actions is None:
                 belief.reset(percepts.codes[i], pose, told[i])
             else:
                 belief.update(int(situation.last_actions[i]), percepts.codes[i], pose, told[i])
             allowed = None if situation.allowed is None else situation.allowed[i]
-            actions[i], info = self.planners[i].plan(belief.states, allowed)
+            spent = shared + time.perf_counter() - begun
+            actions[i], info = self.planners[i].plan(belief.states, allowed, spent)
             self.infos[i] = info | {"effective": belief.effective, "resets": belief.resets}
         return actions
 

@@ -15,6 +15,8 @@ PLANNING_AGENTS = ("pomdp", "search", "qmdp")
 ORACLES = ("optimum", "bayes-optimum", "egocentric-optimum")
 REFERENCE_AGENTS = ("greedy-follower", "greedy-last-seen", "random", *ORACLES)
 AGENTS = LEARNING_AGENTS + PLANNING_AGENTS + REFERENCE_AGENTS
+MOST_SIMULATIONS = 1_000_000
+"""Per second, more than any search here makes: the room that trees get where time is limited, which costs time too."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,8 @@ class SearchConfig:
     simulations: int = 1000
     """Simulations per decision."""
     time_limit: float = 0.0
-    """Seconds per decision after which the search stops early; 0 for no limit (and repeatable results)."""
+    """Seconds per decision, perception and belief included, after which the search stops early; 0 for no limit (and
+    repeatable results)."""
     depth: int = 12
     """Deepest step looked ahead."""
     discount: float = 0.9
@@ -152,6 +155,10 @@ class SearchConfig:
     """Weight of the exploration term there, in units of reward."""
     pomdp_py_simulations: int = 150
     """Simulations per decision of pomdp-py's POUCT, which is far slower per simulation."""
+
+    def time_left(self, spent: float) -> float:
+        """What is left for a search of a decision that has taken `spent` seconds already; 0 where there is no limit."""
+        return max(self.time_limit - spent, 1e-6) if self.time_limit > 0 else 0.0
 
 
 @dataclass(frozen=True)
@@ -176,8 +183,8 @@ class CompareConfig:
     confidence: float = 0.95
     """Coverage of the intervals."""
     planner_milliseconds: float = 0.0
-    """Time that the agents that search get per decision, instead of a number of simulations; 0 for the number.
-    Agents compare at equal time then, but results no longer repeat exactly."""
+    """Time that the agents that search get per decision, from what they see to what they do, instead of a number of
+    simulations; 0 for the number. Agents compare at equal time then, but results no longer repeat exactly."""
     rules: tuple[str, ...] = ()
     """Rule files (docs/asp.md) that no agent may break, neither while it learns nor when it acts. Rules about the
     person act on what the planners expect of it."""
@@ -193,6 +200,6 @@ class CompareConfig:
         """How the planners search here: by time if that is asked for."""
         if self.planner_milliseconds <= 0:
             return self.search
-        enough = 1_000_000
         seconds = self.planner_milliseconds / 1000.0
-        return replace(self.search, time_limit=seconds, simulations=enough, pomdp_py_simulations=enough)
+        enough = max(1000, int(seconds * MOST_SIMULATIONS))
+        return replace(self.search, time_limit=seconds, simulations=enough)

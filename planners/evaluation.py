@@ -18,6 +18,8 @@ from planners.perception import Codec, Perception, Percepts
 from planners.shielding import ActionMask
 
 Columns = dict[str, np.ndarray]
+UNTIMED = 2
+"""Decisions at the start of an episode that are not timed: they load what is compiled, for beliefs and their update."""
 
 
 def evaluation_maps(domain: Domain, variant: str, episodes: int) -> np.ndarray | None:
@@ -61,12 +63,14 @@ class Player:
         self, env: Any, observation: dict[str, np.ndarray], active: np.ndarray, last: np.ndarray | None
     ) -> tuple[np.ndarray, Percepts | None]:
         """Actions int64 [B] in the present situations, and what was perceived."""
+        begun = time.perf_counter()
         percepts = None if self.perception is None else self.perception(observation, env.person_views())
         allowed = None
         if self.mask is not None and self.codec is not None:
             codes = self.codec.codes(observation["view"]) if percepts is None else percepts.codes
             allowed = self.mask(codes, np.asarray(observation["configuration"], np.int64))
-        actions = np.asarray(self.agent.actions(Situation(env, observation, percepts, active, last, allowed)), np.int64)
+        situation = Situation(env, observation, percepts, active, last, allowed, begun)
+        actions = np.asarray(self.agent.actions(situation), np.int64)
         return (actions if allowed is None else permitted(actions, allowed)), percepts
 
 
@@ -96,7 +100,7 @@ def evaluate(
 
     Returns:
         Columns [episodes]: return, length, outcome (code), map_id, discounted_return, ms_per_decision (the first
-        decision left out), and every metric of the domain (docs/metrics.md); those of beliefs only for players with
+        two left out), and every metric of the domain (docs/metrics.md); those of beliefs only for players with
         a perception.
     """
     maps = evaluation_maps(domain, variant, episodes)
@@ -112,7 +116,7 @@ def evaluate(
     while active.any():
         started = time.perf_counter()
         actions, percepts = player.decide(env, observation, active, last)
-        if last is not None:  # the first decision loads what is compiled
+        if length.max() >= UNTIMED:
             spent[active] += (time.perf_counter() - started) / active.sum()
         beliefs = {} if percepts is None else _belief_metrics(domain, player, percepts, env.person_views())
         observation, reward, terminated, truncated, infos = env.step(actions)
@@ -135,7 +139,7 @@ def evaluate(
         "outcome": outcome,
         "map_id": map_ids,
         "discounted_return": discounted,
-        "ms_per_decision": 1000.0 * spent / np.maximum(length - 1, 1),
+        "ms_per_decision": 1000.0 * spent / np.maximum(length - UNTIMED, 1),
     }
 
 

@@ -38,12 +38,15 @@ class IALMSearch:
         self.allowed = np.ones(model.dbn.num_actions, np.bool_)
         self._bits = stream(rng)
 
-    def plan(self, belief: np.ndarray, allowed: np.ndarray | None = None) -> tuple[int, dict[str, Any]]:
+    def plan(
+        self, belief: np.ndarray, allowed: np.ndarray | None = None, spent: float = 0.0
+    ) -> tuple[int, dict[str, Any]]:
         """Choose an action.
 
         Args:
             belief: int16 [P, 2N + 5], equally weighted particles.
             allowed: bool [A], actions that a shield leaves; all by default. The others are not tried at the root.
+            spent: seconds that the decision has taken already.
 
         Returns:
             The action, and what the search saw: values, visits, simulations, nodes, mean and greatest depth, and
@@ -59,7 +62,7 @@ class IALMSearch:
             belief,
             self.tree,
             config.simulations,
-            config.time_limit,
+            config.time_left(spent),
             config.depth,
             config.discount,
             config.exploration,
@@ -67,7 +70,7 @@ class IALMSearch:
             mask,
             self._bits,
         )
-        info["distinct"] = len(np.unique(belief, axis=0))
+        info["distinct"] = len({particle.tobytes() for particle in belief})  # np.unique takes a millisecond
         return best_tried(info, mask), info
 
     def describe(self, seen: int) -> str:

@@ -42,8 +42,10 @@ class MindSearch:
         self.tree = allocate(config.simulations + 2, NUM_ACTIONS)
         self._bits = stream(rng)
 
-    def plan(self, belief: MindParticles, allowed: np.ndarray | None = None) -> tuple[int, dict[str, Any]]:
-        """The best action among those `allowed`, bool [A], and what the search saw."""
+    def plan(
+        self, belief: MindParticles, allowed: np.ndarray | None = None, spent: float = 0.0
+    ) -> tuple[int, dict[str, Any]]:
+        """The best action among those `allowed`, bool [A], and what the search saw; `spent` as of `IALMSearch`."""
         mask = np.ones(NUM_ACTIONS, np.bool_) if allowed is None else np.asarray(allowed, np.bool_)
         clear(self.tree)
         config = self.config
@@ -52,7 +54,7 @@ class MindSearch:
             belief,
             self.tree,
             config.simulations,
-            config.time_limit,
+            config.time_left(spent),
             config.mind_depth,
             config.mind_discount,
             config.mind_exploration,

@@ -201,10 +201,12 @@ class LocalEnvironment(pomdp_py.Environment):
 class LeafValuePOUCT(pomdp_py.POUCT):
     """pomdp-py's POUCT with leaf values read off the model instead of rollouts."""
 
-    def __init__(self, model: IALM, config: SearchConfig) -> None:
+    def __init__(self, model: IALM, config: SearchConfig, spent: float = 0.0) -> None:
+        limited = config.time_limit > 0  # pomdp-py counts either simulations or seconds
         super().__init__(
             max_depth=config.depth,
-            num_sims=config.pomdp_py_simulations,
+            num_sims=-1 if limited else config.pomdp_py_simulations,
+            planning_time=config.time_left(spent) if limited else -1.0,
             discount_factor=config.discount,
             exploration_const=config.exploration,
             rollout_policy=LocalPolicyModel(model.dbn.action_names),
@@ -224,17 +226,19 @@ class POUCTAgent:
     """Decides with pomdp-py's POUCT from a particle belief."""
 
     def __init__(self, model: IALM, compiled: kernels.Model, config: SearchConfig, rng: np.random.Generator) -> None:
-        self.model, self.compiled, self.rng = model, compiled, rng
-        self.planner = LeafValuePOUCT(model, config)
+        self.model, self.compiled, self.config, self.rng = model, compiled, config, rng
         self.root: Any = None
         """Root of the last search's tree, for pictures."""
 
-    def plan(self, belief: np.ndarray, allowed: np.ndarray | None = None) -> tuple[int, dict[str, Any]]:
+    def plan(
+        self, belief: np.ndarray, allowed: np.ndarray | None = None, spent: float = 0.0
+    ) -> tuple[int, dict[str, Any]]:
         """Choose an action.
 
         Args:
             belief: int16 [P, 2N + 5], equally weighted particles.
             allowed: bool [A], actions that a shield leaves; all by default. The others are not tried at the root.
+            spent: seconds that the decision has taken already.
 
         Returns:
             The action, and what the search saw: values and visits per action, simulations.
@@ -242,7 +246,8 @@ class POUCTAgent:
         if allowed is not None and not np.any(allowed):
             raise ValueError("a search needs at least one allowed action")
         agent = RobotAgent(self.model, self.compiled, belief, self.rng, allowed)
-        action = self.planner.plan(agent)
+        planner = LeafValuePOUCT(self.model, self.config, spent)
+        action = planner.plan(agent)
         self.root = agent.tree
         children = agent.tree.children
         found = {a.index: node for a, node in children.items()}
@@ -250,5 +255,5 @@ class POUCTAgent:
         return action.index, {
             "values": [float(found[a].value) if a in found else 0.0 for a in names],
             "visits": [int(found[a].num_visits) if a in found else 0 for a in names],
-            "simulations": int(self.planner.last_num_sims),
+            "simulations": int(planner.last_num_sims),
         }

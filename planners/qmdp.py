@@ -47,8 +47,10 @@ class LocalQMDP:
         self.num_actions, self.discount = model.dbn.num_actions, config.discount
         self._bits = stream(rng)
 
-    def plan(self, belief: np.ndarray, allowed: np.ndarray | None = None) -> tuple[int, dict[str, Any]]:
-        """The action, and the value of each; belief int16 [P, 2N + 5], allowed bool [A]."""
+    def plan(
+        self, belief: np.ndarray, allowed: np.ndarray | None = None, spent: float = 0.0
+    ) -> tuple[int, dict[str, Any]]:
+        """The action, and the value of each; belief int16 [P, 2N + 5], allowed bool [A]; it searches for no time."""
         mask = np.ones(self.num_actions, np.bool_) if allowed is None else np.asarray(allowed, np.bool_)
         if not mask.any():
             raise ValueError("a search needs at least one allowed action")

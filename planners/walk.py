@@ -27,6 +27,9 @@ from planners.mind_walk import mind_advance, mind_begin, mind_room
 from planners.random_bits import drawn, uniform
 from planners.tree import NO_CHILD, Tree, backup, backup_best, best_by_ucb, find_child
 
+_FIRST = 16
+"""Simulations, where time is limited, before it is known how many fit."""
+
 
 class PackedPOMDP(NamedTuple):
     """A `TabularPOMDP` in flat arrays; successors of (a, s) lie at begin[a, s] : begin[a, s + 1]."""
@@ -296,19 +299,22 @@ def walks(
 ) -> dict[str, Any]:
     """Simulate up to `simulations` times, for at most `time_limit` seconds (0: no limit); what came of it.
 
+    However short the limit is, a few simulations are made.
+
     Returns:
         values and visits per action of the root, simulations, nodes, mean and greatest depth, and `full`: whether
         the tree had no room left.
     """
     depths = np.zeros(2, np.int64)
     started, done = time.perf_counter(), 0
-    chunk = 128 if time_limit > 0 else simulations
-    while done < simulations:
-        if time_limit > 0 and done and time.perf_counter() - started >= time_limit:
-            break
-        count = min(chunk, simulations - done)
+    count = min(_FIRST if time_limit > 0 else simulations, simulations)
+    while count:
         walk(model, belief, tree, count, depth, discount, exploration, bellman, rollout, allowed, bits, depths)
         done += count
+        gone = time.perf_counter() - started
+        # As many as should fit into most of what is left, so that the last ones do not outlast it by much.
+        fitting = int(0.7 * done / max(gone, 1e-9) * (time_limit - gone)) if time_limit > 0 else simulations
+        count = max(min(fitting, simulations - done), 0)
     size = int(tree.size[0])
     return {
         "values": tree.q_value[0].tolist(),

@@ -1,13 +1,21 @@
 from __future__ import annotations
 
+import time
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pomdp_py
 import pytest
 
 from domains.classic import tiger
+from domains.core import ViewGeometry
 from planners import kernels
-from planners.config import SearchConfig
+from planners.agents import PlanningAgent, Situation
+from planners.config import CompareConfig, SearchConfig
 from planners.ialm_search import IALMSearch
+from planners.perception import Percepts
 from planners.pomdp import TabularPOMDP
 from planners.pomdp_py_adapter import LocalEnvironment, LocalState, POUCTAgent, RobotAction, RobotAgent
 from planners.qmdp import LocalQMDP, TabularQMDP
@@ -80,6 +88,49 @@ def test_same_seed_same_plan_and_masks_hold() -> None:
     for planner in (IALMSearch, POUCTAgent):
         with pytest.raises(ValueError, match="at least one allowed action"):
             planner(model, compiled, CONFIG, np.random.default_rng(3)).plan(_beliefs(), np.zeros(4, np.bool_))
+
+
+def test_a_limit_of_time_holds_for_the_whole_decision() -> None:
+    """However much of it has gone already: little left, few simulations; none left, as few as there can be."""
+    model = small_ialm(0)
+    compiled = kernels.compile_model(model)
+    config = replace(CONFIG, time_limit=0.5, simulations=100_000)
+    for planner in (IALMSearch, POUCTAgent):
+        simulations = [
+            planner(model, compiled, config, np.random.default_rng(3)).plan(_beliefs(), spent=spent)[1]["simulations"]
+            for spent in (0.1, 0.5, 3.0)
+        ]
+        assert simulations[0] > 50 > 16 >= simulations[1] == simulations[2] > 0
+    assert replace(CONFIG, time_limit=0.0).time_left(3.0) == 0.0  # no limit, whatever was spent
+
+
+def test_what_comes_before_the_search_counts_as_time_spent() -> None:
+    model = small_ialm(0)
+    given: list[float] = []
+
+    class Slow(PlanningAgent):
+        def _belief(self, rng: np.random.Generator) -> Any:
+            return SimpleNamespace(reset=lambda *_: time.sleep(0.02), states=None, effective=0.0, resets=0)
+
+        def _planner(self, rng: np.random.Generator) -> Any:
+            return SimpleNamespace(plan=lambda belief, allowed, spent: (given.append(spent) or 0, {}))
+
+    agent = Slow("search", model, CONFIG, ViewGeometry(), 0)
+    percepts = Percepts(np.zeros((2, N), np.uint8), np.zeros(0), np.zeros((2, N, 2)), np.zeros(2, np.int64))
+    situation = Situation(
+        SimpleNamespace(), {}, percepts, np.ones(2, np.bool_), None, None, time.perf_counter() - 100.0
+    )
+    agent.actions(situation)
+    assert len(given) == 2
+    assert all(50.02 <= spent < 99.0 for spent in given)  # half of what both share, and what the own belief took
+
+
+def test_trees_get_room_by_the_time_they_are_given() -> None:
+    """Clearing room for a million nodes took longer than the search itself."""
+    short = CompareConfig(planner_milliseconds=5.0).search_of_cells
+    assert 1000 <= short.simulations <= 10_000
+    assert CompareConfig(planner_milliseconds=1000.0).search_of_cells.simulations >= 500_000
+    assert CompareConfig().search_of_cells == CompareConfig().search
 
 
 def test_the_tree_can_be_drawn() -> None:
