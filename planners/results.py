@@ -1,7 +1,7 @@
 """What a comparison leaves in results/: one record per agent and condition, and tables and plots for papers.
 
 episodes (all seeds pooled) -> records (means, interquartile means, intervals, regret, share of the optimum)
-                            -> comparison.parquet .csv .md .tex, regret.parquet .csv, statistics.json, plots
+                            -> tables (planners.result_tables), statistics.json, plots
 
 Intervals: stratified by map where maps come more than once, since every agent meets the same ones; where each comes
 once, of what the optimum there does not explain (a control variate); for agents that learn, with three seeds or more,
@@ -11,25 +11,25 @@ in the same episodes: on the same maps, or, where a map says too little (who kno
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from domains.core import Domain, DomainError
-from nesy.run_folder import atomic_path, read_json, write_json
-from planners.config import ORACLES, CompareConfig
+from nesy.run_folder import read_json, write_json
+from planners.config import ORACLES, PLANNING_AGENTS, CompareConfig
+from planners.improvement import Played, improvement
 from planners.statistics import (
     Interval,
     bootstrap,
     interquartile_mean,
+    means_with_intervals,
     over_seeds,
     performance_profile,
-    probability_of_improvement,
     running_average,
     stratified_bootstrap,
 )
@@ -37,7 +37,7 @@ from planners.statistics import (
 Optimum = dict[str, Any]
 """`mean_return`, `success`, and, where maps can be listed, `maps`: [{map_id, return, success}]."""
 CONDITION = ("agent", "inputs", "influence", "variant")
-METRICS_OF_NO_EPISODE = ("seed", "phase", "episode", "outcome", "map_id", "step", *CONDITION)
+METRICS_OF_NO_EPISODE = ("seed", "phase", "episode", "outcome", "map_id", "step", "experience_steps", *CONDITION)
 MOST_POINTS = 400
 """Points of a stored learning curve."""
 
@@ -54,6 +54,7 @@ def write_results(
     `left_out` says what has no episodes, and why.
     """
     from nesy.report.comparison_figures import save_figures
+    from planners.result_tables import write_tables
 
     played = _groups(episodes, "eval")
     peers = {condition[3]: rows for condition, rows in played.items() if condition[0] == "optimum"}
@@ -69,7 +70,7 @@ def write_results(
         "improvement": _improvements(played, config),
         "curves": [_curve(condition, rows, config) for condition, rows in _groups(episodes, "train").items()],
     }
-    _write_tables(folder, records, regrets)
+    write_tables(folder, records, regrets)
     write_json(folder / "statistics.json", statistics)
     save_figures(folder / "plots", records, statistics)
     return records
@@ -132,15 +133,20 @@ def _interval(
     best: np.ndarray | None = None,
 ) -> Interval:
     """Mean (or interquartile mean) of `values`; `best` is what the optimum gets in each of these episodes."""
-    seeds = rows["seed"]
-    if rows["experience_steps"].max() > 0 and len(np.unique(seeds)) >= 3 and not robust:
-        return over_seeds(values, seeds, 0, config.confidence)
+    if _over_seeds(rows) and not robust:
+        return over_seeds(values, rows["seed"], 0, config.confidence)
     statistic = interquartile_mean if robust else np.mean
     if np.unique(rows["map_id"], return_counts=True)[1].min() >= 2:
         return stratified_bootstrap(values, rows["map_id"], 0, config.confidence, statistic)
     if best is None or robust:  # nothing to resample within a map
         return bootstrap(values, 0, config.confidence, statistic)
     return bootstrap(values - _explained(values, best), 0, config.confidence)
+
+
+def _over_seeds(rows: dict[str, np.ndarray]) -> bool:
+    """Whether these are several trainings. Planners' seeds are none: all plan with the same learned model."""
+    learned = rows["experience_steps"].max() > 0 and rows["agent"][0] not in PLANNING_AGENTS
+    return bool(learned and len(np.unique(rows["seed"])) >= 3)
 
 
 def _explained(values: np.ndarray, best: np.ndarray) -> np.ndarray:
@@ -167,11 +173,13 @@ def _record(
     if record["agent"] == "optimum" and optimum is not None:
         mean_return, mean_success = _exact(optimum["mean_return"]), _exact(optimum["success"])
         reference = optimum["mean_return"]
-    metrics = {
-        name: float(np.nanmean(column))
+    columns = {
+        "steps" if name == "length" else name: column.astype(np.float64)
         for name, column in rows.items()
         if name not in METRICS_OF_NO_EPISODE and column.dtype.kind in "fi" and not np.isnan(column.astype(float)).all()
     }
+    groups = rows["seed"] if _over_seeds(rows) else rows["map_id"]
+    measured = means_with_intervals(columns, groups, _over_seeds(rows), 0, config.confidence)
     return {
         **record,
         "seeds": [int(seed) for seed in np.unique(rows["seed"])],
@@ -183,7 +191,8 @@ def _record(
         "experience_steps": int(rows["experience_steps"].max()),
         "share_of_optimum": mean_return["mean"] / reference if reference else None,
         "regret": None if best is None else _interval(best - returns, rows, config).as_dict(),
-        "metrics": metrics,
+        "metrics": {name: found.mean for name, found in measured.items()},
+        "metric_intervals": {name: [found.low, found.high] for name, found in measured.items()},
     }
 
 
@@ -262,20 +271,22 @@ def _profiles(played: dict[tuple[str, ...], dict[str, np.ndarray]]) -> dict[str,
 
 
 def _improvements(played: dict[tuple[str, ...], dict[str, np.ndarray]], config: CompareConfig) -> list[dict[str, Any]]:
-    """P(an episode of the one beats an episode of the other) for every pair of conditions of one variant."""
+    """P(an episode of the one beats one of the other on the same map) for every pair of conditions of one variant."""
     conditions = [key for key in played if key[0] not in ORACLES]
-    return [
-        {
-            "ours": _name(ours),
-            "theirs": _name(theirs),
-            **probability_of_improvement(
-                played[ours]["return"], played[theirs]["return"], 0, config.confidence, resamples=200
-            ).as_dict(),
-        }
-        for ours in conditions
-        for theirs in conditions
-        if ours != theirs and ours[3] == theirs[3]
-    ]
+    episodes = {key: _played(played[key]) for key in conditions}
+    found = []
+    for ours, theirs in combinations(conditions, 2):
+        if ours[3] == theirs[3]:
+            p, maps = improvement(episodes[ours], episodes[theirs], 0, config.confidence)
+            there = {"ours": _name(ours), "theirs": _name(theirs), "maps": maps, **p.as_dict()}
+            back = {"mean": 1 - p.mean, "low": 1 - p.high, "high": 1 - p.low}
+            found += [there, {"ours": _name(theirs), "theirs": _name(ours), "maps": maps, **back}]
+    order = {_name(key): at for at, key in enumerate(conditions)}
+    return sorted(found, key=lambda pair: (order[pair["ours"]], order[pair["theirs"]]))
+
+
+def _played(rows: dict[str, np.ndarray]) -> Played:
+    return Played(rows["return"], rows["map_id"], rows["seed"] if _over_seeds(rows) else None)
 
 
 def _curve(condition: tuple[str, ...], rows: dict[str, np.ndarray], config: CompareConfig) -> dict[str, Any]:
@@ -300,55 +311,3 @@ def _curve(condition: tuple[str, ...], rows: dict[str, np.ndarray], config: Comp
         low, high = np.quantile(means, [tail, 1 - tail], axis=0)
         curve[name] = {"mean": lines.mean(axis=0).tolist(), "low": low.tolist(), "high": high.tolist()}
     return curve
-
-
-def _write_tables(folder: Path, records: list[dict[str, Any]], regrets: list[dict[str, Any]]) -> None:
-    from nesy.report.text import COMPARISON_COLUMNS, comparison_rows
-
-    flat = [_flat(record) for record in records]
-    for name, rows in (("comparison", flat), ("regret", regrets)):
-        if not rows:
-            continue
-        columns = list(dict.fromkeys(column for row in rows for column in row))
-        with atomic_path(folder / f"{name}.parquet") as temporary:
-            table = pa.table({column: [row.get(column) for row in rows] for column in columns})
-            pq.write_table(table, temporary, compression="zstd")
-        with (
-            atomic_path(folder / f"{name}.csv") as temporary,
-            temporary.open("w", newline="", encoding="utf-8") as stream,
-        ):
-            writer = csv.DictWriter(stream, columns)
-            writer.writeheader()
-            writer.writerows(rows)
-    texts = comparison_rows(records)
-    with atomic_path(folder / "comparison.md") as temporary:
-        temporary.write_text(_markdown(COMPARISON_COLUMNS, texts), encoding="utf-8")
-    with atomic_path(folder / "comparison.tex") as temporary:
-        temporary.write_text(_latex(COMPARISON_COLUMNS, texts), encoding="utf-8")
-
-
-def _flat(record: dict[str, Any]) -> dict[str, Any]:
-    """A record as one row: nested figures with dotted names, the seeds as text."""
-    row: dict[str, Any] = {}
-    for name, value in record.items():
-        if isinstance(value, dict):
-            row |= {f"{name}.{inner}": figure for inner, figure in value.items()}
-        else:
-            row[name] = " ".join(map(str, value)) if isinstance(value, list) else value
-    return row
-
-
-def _markdown(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [columns, ["---"] * len(columns), *rows]
-    return "".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |\n" for line in lines)
-
-
-def _latex(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    special = {character: f"\\{character}" for character in "&%$#_{}"}
-    special |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-
-    def line(cells: Sequence[str]) -> str:
-        return " & ".join("".join(special.get(c, c) for c in cell) for cell in cells) + r" \\"
-
-    body = [line(columns), r"\hline", *(line(row) for row in rows)]
-    return "\n".join([rf"\begin{{tabular}}{{{'l' * 4}{'r' * (len(columns) - 4)}}}", *body, r"\end{tabular}", ""])

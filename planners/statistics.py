@@ -8,7 +8,7 @@ at the edge of the statistical precipice", NeurIPS 2021.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -113,6 +113,48 @@ def over_seeds(
     """  # noqa: D205
     means = np.array([np.mean(np.asarray(values)[np.asarray(seeds) == label]) for label in np.unique(seeds)])
     return bootstrap(means, seed, confidence, resamples=resamples)
+
+
+def means_with_intervals(
+    columns: Mapping[str, np.ndarray],
+    groups: np.ndarray,
+    whole: bool,
+    seed: int,
+    confidence: float = 0.95,
+    resamples: int = 1000,
+) -> dict[str, Interval]:
+    """Means of many measures of the same episodes, all from the same resamples.
+
+    Args:
+        columns: float [n] each, with NaN where an episode has no such measure; none is NaN throughout.
+        groups: labels [n].
+        whole: resample whole groups (trainings), each counting alike; otherwise episodes within each group, or
+            all episodes where a group of one leaves nothing to resample.
+        seed: of the resampling.
+        confidence: coverage.
+        resamples: bootstrap samples.
+    """
+    rng = np.random.default_rng(seed)
+    labels, group, sizes = np.unique(groups, return_inverse=True, return_counts=True)
+    if whole:
+        drawn = rng.multinomial(len(labels), np.full(len(labels), 1 / len(labels)), resamples)
+        weights = drawn[:, group] / sizes[group]
+    else:
+        if sizes.min() < 2:
+            group, sizes = np.zeros_like(group), np.array([len(group)])
+        weights = np.zeros((resamples, len(group)))
+        for label, size in enumerate(sizes):
+            weights[:, group == label] = rng.multinomial(size, np.full(size, 1 / size), resamples)
+    values = np.stack(list(columns.values()), axis=1)
+    known = ~np.isnan(values)
+    filled = np.where(known, values, 0.0)
+    point = 1 / sizes[group] if whole else np.ones(len(group))
+    means = (point @ filled) / (point @ known)
+    with np.errstate(invalid="ignore"):  # a resample may hold no episode with a rare measure
+        draws = (weights @ filled) / (weights @ known)
+    tail = (1.0 - confidence) / 2
+    low, high = np.nanquantile(draws, [tail, 1.0 - tail], axis=0)
+    return {name: Interval(float(means[at]), float(low[at]), float(high[at])) for at, name in enumerate(columns)}
 
 
 def interquartile_mean(values: np.ndarray, axis: int = -1) -> np.ndarray:

@@ -21,6 +21,8 @@ from matplotlib.figure import Figure
 from nesy.report.figures import PALETTE
 from nesy.run_folder import atomic_path
 
+MORE = ("#7F5539", "#8A8A8A", "#6A4C93")
+"""Colours beyond the palette's, for comparisons of many agents."""
 Curve = dict[str, Any]
 """`name`, `variant`, `seeds`, `episodes`, `window`, `episode` [P]; `policy`, `running_average`: mean, low, high [P]."""
 
@@ -29,7 +31,7 @@ def save_figures(folder: Path, records: Sequence[dict[str, Any]], statistics: di
     """Write every figure of a comparison as PNG and SVG."""
     figures = {"returns": returns(records), "profiles": profiles(statistics["profiles"])}
     if statistics["improvement"]:
-        figures["improvement"] = improvement(statistics["improvement"])
+        figures["improvement"] = improvement(statistics)
     if statistics["curves"]:
         figures["learning"] = learning(statistics["curves"], optima(records))
     for name, figure in figures.items():
@@ -52,9 +54,9 @@ def save(figure: Figure, path: Path) -> None:
 def returns(records: Sequence[dict[str, Any]]) -> Figure:
     """Mean return (circle) and interquartile mean (diamond) of every condition; exact optima as dotted lines."""
     figure, axes = _axes(8, 0.34 * len(records) + 1.0)
-    agents = list(dict.fromkeys(record["agent"] for record in records))
+    colours = _colours([record["agent"] for record in records])
     for row, record in enumerate(records):
-        colour = PALETTE[agents.index(record["agent"]) % len(PALETTE)]
+        colour = colours[record["agent"]]
         for shift, mark, interval in ((-0.12, "o", record["return"]), (0.12, "D", record["interquartile_mean"])):
             if interval.get("low") is not None:
                 axes.plot([interval["low"], interval["high"]], [row + shift] * 2, color=colour, linewidth=1.5)
@@ -72,7 +74,8 @@ def returns(records: Sequence[dict[str, Any]]) -> Figure:
 def profiles(statistics: dict[str, Any]) -> Figure:
     """Share of episodes with a return above each threshold: a panel per variant, colours by agent, dashes by mode."""
     names = [name.split(" / ") for name in statistics["shares"]]
-    variants, agents = (list(dict.fromkeys(name[at] for name in names)) for at in (-1, 0))
+    variants = list(dict.fromkeys(name[-1] for name in names))
+    colours = _colours([name[0] for name in names])
     inside = [tuple(name[1:-1]) for name in names]
     dashes = dict(zip(dict.fromkeys(inside), cycle(("-", "--", ":", "-.")), strict=False))
     figure = Figure(figsize=(9, 3.2 * len(variants)), layout="constrained")
@@ -84,8 +87,12 @@ def profiles(statistics: dict[str, Any]) -> Figure:
                 label = (
                     f"{' / '.join(parts[:-1])} ({_counted(statistics['seeds'][name], statistics['episodes'][name])})"
                 )
-                colour = PALETTE[agents.index(parts[0]) % len(PALETTE)]
-                axes.plot(statistics["thresholds"], shares, dashes[condition], color=colour, label=label, linewidth=1.2)
+                axes.plot(
+                    *(statistics["thresholds"], shares, dashes[condition]),
+                    color=colours[parts[0]],
+                    label=label,
+                    linewidth=1.2,
+                )
         axes.set_title(variant, fontsize=9)
         axes.set_xlabel("return")
         axes.set_ylabel("share of episodes above")
@@ -94,22 +101,44 @@ def profiles(statistics: dict[str, Any]) -> Figure:
     return figure
 
 
-def improvement(pairs: Sequence[dict[str, Any]]) -> Figure:
-    """Probability that an episode of the row's agent beats one of the column's."""
-    ours = list(dict.fromkeys(pair["ours"] for pair in pairs))
-    figure, axes = _axes(0.45 * len(ours) + 2.5, 0.36 * len(ours) + 1.5)
-    table = np.full((len(ours), len(ours)), np.nan)
+def improvement(statistics: dict[str, Any]) -> Figure:
+    """Probability that an episode of the row's agent beats one of the column's on the same map: a panel per variant."""
+    pairs, counted = statistics["improvement"], statistics["profiles"]
+    variants: dict[str, list[str]] = {}
     for pair in pairs:
-        table[ours.index(pair["ours"]), ours.index(pair["theirs"])] = pair["mean"]
-    axes.imshow(np.ma.masked_invalid(table), cmap="RdBu", vmin=0, vmax=1)
-    for row, column in np.argwhere(~np.isnan(table)):
-        value = table[row, column]
-        colour = "#ffffff" if abs(value - 0.5) > 0.3 else "#000000"  # both ends of the scale are dark
-        axes.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=6, color=colour)
-    axes.set_xticks(range(len(ours)), ours, rotation=90, fontsize=7)
-    axes.set_yticks(range(len(ours)), ours, fontsize=7)
-    axes.grid(visible=False)
-    axes.set_title("P(an episode of the row beats one of the column)", fontsize=9)
+        names = variants.setdefault(pair["ours"].rpartition(" / ")[2], [])
+        names += [pair["ours"]] if pair["ours"] not in names else []
+    sizes = [0.36 * len(names) for names in variants.values()]
+    letters = 0.06 * max(len(pair["ours"]) for pair in pairs)  # inches that the longest name takes
+    width = max(0.45 * max(map(len, variants.values())), 2.0) + letters + 2.5
+    figure = Figure(figsize=(width, sum(sizes) + (letters + 0.8) * len(sizes)), layout="constrained")
+    panels = figure.subplots(len(variants), 1, squeeze=False, height_ratios=sizes)[:, 0]
+    for axes, (variant, names) in zip(panels, variants.items(), strict=True):
+        table = np.full((len(names), len(names)), np.nan)
+        for pair in pairs:
+            if pair["ours"] not in names:
+                continue
+            row, column = names.index(pair["ours"]), names.index(pair["theirs"])
+            table[row, column] = value = pair["mean"]
+            axes.text(
+                *(column, row, f"{value:.2f}"),
+                ha="center",
+                va="center",
+                fontsize=6,
+                color="#ffffff" if abs(value - 0.5) > 0.3 else "#000000",  # both ends of the scale are dark
+                weight="normal" if pair["low"] <= 0.5 <= pair["high"] else "bold",
+            )
+        axes.imshow(np.ma.masked_invalid(table), cmap="RdBu", vmin=0, vmax=1)
+        short = [name.removesuffix(f" / {variant}") for name in names]
+        counts = [_counted(counted["seeds"][name], counted["episodes"][name]) for name in names]
+        axes.set_xticks(range(len(names)), short, rotation=90, fontsize=7)
+        labels = [f"{name}  ({count})" for name, count in zip(short, counts, strict=True)]
+        axes.set_yticks(range(len(names)), labels, fontsize=7)
+        axes.set_title(
+            f"{variant}: P(an episode of the row beats one of the column on the same map);\n"
+            "bold: its 95 % interval leaves out 0.5",
+            fontsize=8,
+        )
     return figure
 
 
@@ -149,6 +178,12 @@ def learning(curves: Sequence[Curve], optima: Mapping[str, float], notes: Sequen
     if notes:
         figure.supxlabel("\n".join(notes), fontsize=7)
     return figure
+
+
+def _colours(agents: Sequence[str]) -> dict[str, str]:
+    """A colour for each agent, black for the optimum."""
+    others = [agent for agent in dict.fromkeys(agents) if agent != "optimum"]
+    return {"optimum": "#000000"} | dict(zip(others, cycle((*PALETTE[:-1], *MORE)), strict=False))
 
 
 def _axes(width: float, height: float) -> tuple[Figure, Axes]:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from domains.core import load_domain
+from domains.person_following.metrics import BELIEF_METRICS, METRICS
 from nesy.errors import UserError
 from nesy.run_folder import RunFolder, read_json
 from planners.baselines import LastSeenFollower, OracleFollower
@@ -16,6 +18,7 @@ from planners.config import CompareConfig
 from planners.evaluation import Player, evaluate
 from planners.results import _interval
 
+DOCUMENTED = Path(__file__).parents[2] / "docs" / "metrics.md"
 REFERENCES = CompareConfig(agents=("greedy-follower", "random", "greedy-last-seen"), episodes=42)
 
 
@@ -69,8 +72,8 @@ def test_mistakes_are_named() -> None:
         ({"agents": ("dqm",)}, "unknown agent 'dqm'"),
         ({"inputs": ("all",)}, "unknown input set 'all'"),
         ({"influences": ("telepathy",)}, "unknown influence mode 'telepathy'"),
-        ({"agents": ()}, "lists of agents and of policies are empty"),
-        ({"episodes": 0}, "at least one evaluation episode"),
+        ({"agents": ()}, "list of agents is empty"),
+        ({"episodes": 0}, "episodes must be at least 1"),
     ):
         with pytest.raises(UserError, match=message):
             grid(CompareConfig(**change))
@@ -115,6 +118,16 @@ def test_every_metric_is_a_column_and_every_table_is_written(tmp_path: Path, mon
     monkeypatch.setattr("planners.results.map_optimum", lambda *_: {"mean_return": 100.0, "success": 1.0, "maps": maps})
     (record,) = compare(run, CompareConfig(agents=("greedy-follower",), episodes=84))
     columns = pq.read_table(run.results / "episodes.parquet").column_names
+    assert set(METRICS) | set(BELIEF_METRICS) <= set(re.findall(r"^\| `(\w+)`", DOCUMENTED.read_text(), re.MULTILINE))
+    measures = (run.results / "measures.md").read_text()
+    for name in METRICS:
+        assert name in record["metrics"]
+        low, high = record["metric_intervals"][name]
+        assert low - 1e-9 <= record["metrics"][name] <= high + 1e-9
+        assert f" {name} |" in measures
+    header = (run.results / "comparison.csv").read_text().splitlines()[0].split(",")
+    assert {"metrics.spl", "metrics.spl.low", "metrics.spl.high"} < set(header)
+    assert r"interquartile\_mean" in (run.results / "measures.tex").read_text()
     assert {"spl", "psc", "recovery_time", "person_delay", "experience_steps", "ms_per_decision"} <= set(columns)
     assert record["regret"]["mean"] == pytest.approx(100 - record["return"]["mean"])
     assert record["interquartile_mean"]["mean"] > record["return"]["mean"]  # a fifth of the maps is out of reach
@@ -132,6 +145,29 @@ def test_every_metric_is_a_column_and_every_table_is_written(tmp_path: Path, mon
         assert "<svg" in (run.results / "plots" / f"{name}.svg").read_text()
 
 
+def test_trainings_are_resampled_and_planners_seeds_are_not() -> None:
+    """Seeds of a planner share their model: what differs is luck within the same maps."""
+    rows = {"seed": np.repeat([0, 1, 2], 84), "experience_steps": np.full(252, 1000), "map_id": np.arange(252) % 42}
+    values = np.repeat([0.0, 10.0, 20.0], 84)
+    for agent, widest in (("dqn", 20.0), ("file mine", 20.0), ("search", 2.0), ("pomdp", 2.0)):
+        found = _interval(values, rows | {"agent": np.full(252, agent)}, CompareConfig())
+        assert found.high - found.low == pytest.approx(widest, abs=0.5)
+
+
+def test_figures_of_several_variants_say_how_much_is_in_them(tmp_path: Path) -> None:
+    compare(RunFolder(tmp_path), CompareConfig(agents=("greedy-follower", "random"), variants=("paper", "clean")))
+    drawn = (tmp_path / "results" / "plots" / "improvement.svg").read_text()
+    assert drawn.count("greedy-follower  (1 seed, 168 episodes)") == 2  # comments of matplotlib's SVG hold the text
+    pairs = read_json(tmp_path / "results" / "statistics.json")["improvement"]
+    assert [(pair["ours"], pair["theirs"]) for pair in pairs[:2]] == [
+        ("greedy-follower / paper", "random / paper"),
+        ("random / paper", "greedy-follower / paper"),
+    ]
+    assert pairs[0]["maps"] == 42
+    assert pairs[0]["mean"] == pytest.approx(1 - pairs[1]["mean"])
+    assert pairs[0]["mean"] > 0.9  # on the same map; regardless of maps a fifth of them would weigh it down
+
+
 def test_an_oracle_out_of_reach_is_left_out_with_its_reason(tmp_path: Path) -> None:
     run = RunFolder(tmp_path)
     config = CompareConfig(agents=("greedy-follower", "optimum"), variants=("occluded",), episodes=2)
@@ -145,6 +181,7 @@ def test_an_oracle_out_of_reach_is_left_out_with_its_reason(tmp_path: Path) -> N
 def test_with_every_map_once_what_is_uncertain_is_what_the_optimum_does_not_explain() -> None:
     best = np.repeat([0.0, 110.0], 21)
     rows = {"seed": np.zeros(42), "experience_steps": np.zeros(42), "map_id": np.arange(42)}
+    rows["agent"] = np.full(42, "random")
     noise = np.random.default_rng(0).normal(size=42)
     against = noise + 50 - best / 2  # bad where the optimum is good: nothing of it is explained
     for values, doubt in ((best - 3, 0 * noise), (best - 3 + noise, noise), (noise, noise), (against, against)):

@@ -3,9 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from planners.improvement import Played, improvement
 from planners.statistics import (
     bootstrap,
     interquartile_mean,
+    means_with_intervals,
     over_seeds,
     performance_profile,
     probability_of_improvement,
@@ -54,6 +56,57 @@ def test_running_averages_by_hand() -> None:
     values = np.array([1.0, 3.0, 5.0, 7.0])
     assert running_average(values).tolist() == [1.0, 2.0, 3.0, 4.0]
     assert running_average(values, 2).tolist() == [1.0, 2.0, 4.0, 6.0]
+
+
+def test_improvement_is_counted_map_by_map() -> None:
+    maps = np.repeat(np.arange(10), 4)
+    worth = 100.0 * maps
+    ours, theirs = Played(worth + 1.0, maps), Played(worth, maps)
+    found, counted = improvement(ours, theirs, 0)
+    assert (found.mean, found.low, found.high, counted) == (1.0, 1.0, 1.0, 10)
+    assert probability_of_improvement(ours.returns, theirs.returns, 0).mean == pytest.approx(0.55)
+    assert improvement(theirs, ours, 0)[0].mean == 0.0
+    assert improvement(ours, ours, 0)[0].mean == 0.5
+    fewer = improvement(ours, Played(theirs.returns[:20], maps[:20] + 5), 0)  # on maps 5 to 9 alone
+    assert fewer[0].mean == 1.0
+    assert fewer[1] == 5
+    none = improvement(ours, Played(theirs.returns, maps + 100), 0)
+    assert none[0].mean == pytest.approx(0.55)
+    assert none[1] == 0
+
+
+def test_improvement_resamples_what_is_uncertain() -> None:
+    rng = np.random.default_rng(0)
+    maps, luck = np.repeat(np.arange(20), 6), rng.normal(size=120)
+    within, _ = improvement(Played(luck, maps), Played(rng.normal(size=120), maps), 0, resamples=2000)
+    assert within.low < within.mean < within.high
+    assert 0.03 < within.high - within.low < 0.3
+    once, _ = improvement(Played(np.arange(20.0), np.arange(20)), Played(np.full(20, 4.5), np.arange(20)), 0)
+    assert once.mean == 0.75
+    assert once.low < 0.7 < 0.8 < once.high
+    trainings = np.tile([0, 1, 2], 40)  # two of three trainings win everywhere
+    over, _ = improvement(Played(np.where(trainings > 0, 1.0, -1.0), maps, trainings), Played(np.zeros(120), maps), 0)
+    assert over.mean == pytest.approx(2 / 3)
+    assert (over.low, over.high) == pytest.approx((0.0, 1.0))
+
+
+def test_means_of_many_measures_have_the_intervals_of_each() -> None:
+    rng = np.random.default_rng(0)
+    groups = np.repeat(np.arange(12), 5)
+    values = groups + rng.normal(size=60)
+    rare = np.where(np.arange(60) % 7 == 0, values, np.nan)
+    found = means_with_intervals({"all": values, "rare": rare}, groups, False, 0, resamples=4000)
+    alone = stratified_bootstrap(values, groups, 1, resamples=4000)
+    assert found["all"].mean == pytest.approx(alone.mean)
+    assert (found["all"].low, found["all"].high) == pytest.approx((alone.low, alone.high), abs=0.02)
+    assert found["rare"].mean == pytest.approx(np.nanmean(rare))
+    assert found["rare"].low < found["rare"].mean < found["rare"].high
+    once = means_with_intervals({"all": values}, np.arange(60), False, 0, resamples=4000)["all"]
+    plain = bootstrap(values, 1, resamples=4000)
+    assert (once.low, once.high) == pytest.approx((plain.low, plain.high), abs=0.15)
+    whole = means_with_intervals({"all": values}, groups, True, 0, resamples=4000)["all"]
+    spread = over_seeds(values, groups, 1)
+    assert (whole.mean, whole.low, whole.high) == pytest.approx((spread.mean, spread.low, spread.high), abs=0.15)
 
 
 def test_improvement_counts_as_the_rank_test_does() -> None:

@@ -44,8 +44,9 @@ def make(run: RunFolder, summary: dict[str, Any]) -> str:
         if statistics["improvement"]:
             parts.append(
                 figure(
-                    figures.svg(comparison_figures.improvement(statistics["improvement"])),
-                    "Probability of improvement: how often an episode of one agent beats one of another, ties half.",
+                    figures.svg(comparison_figures.improvement(statistics)),
+                    "Probability of improvement: how often an episode of one agent beats one of another on the same "
+                    "map, ties half.",
                     "Probability of improvement for every pair of agents",
                 )
             )
