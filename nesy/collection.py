@@ -14,7 +14,6 @@ import numpy as np
 
 from domains.core import BatchedEnvironment, Domain
 from nesy.config import CollectConfig
-from nesy.errors import UserError
 from nesy.experience import SOURCES, count_rows, write_part
 from nesy.progress import SILENT, Progress, Task
 
@@ -48,18 +47,7 @@ def plan(config: CollectConfig) -> list[Shard]:
     Half of the crossing episodes are random and half by the expert. Of the following episodes a quarter is
     random, a quarter by the expert, and the rest switches between the two. As no episode of that task can look
     around far from the person, half as many again explore its maps without one.
-
-    Raises:
-        UserError: an impossible number.
     """
-    for name in ("crossing_episodes", "following_episodes"):
-        if getattr(config, name) < 0:
-            raise UserError(f"collect: {name} must not be negative, got {getattr(config, name)}")
-    for name in ("num_envs", "shard_episodes"):
-        if getattr(config, name) < 1:
-            raise UserError(f"collect: {name} must be at least 1, got {getattr(config, name)}")
-    if not 0 <= config.following_mixture <= 1:
-        raise UserError(f"collect: following_mixture must be in [0, 1], got {config.following_mixture}")
     quarter = config.following_episodes // 4
     episodes = {
         "crossing-random": config.crossing_episodes // 2,
@@ -69,8 +57,6 @@ def plan(config: CollectConfig) -> list[Shard]:
         "following-expert": quarter,
         "following-mixture": config.following_episodes - 2 * quarter,
     }
-    if not sum(episodes.values()):
-        raise UserError("collect: no episodes to collect; set crossing_episodes or following_episodes")
     shards: list[Shard] = []
     done = 0
     for source in SOURCES:

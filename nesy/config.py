@@ -6,7 +6,36 @@ Every field's docstring is its help text on the command line.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
+
+from nesy.errors import UserError
+
+
+def check_ranges(config: Any, section: str, **intervals: str) -> None:
+    """Refuse settings outside their intervals, written as in mathematics: `[0, 1)`, `(0, inf)`.
+
+    Args:
+        config: holds the settings, numbers or tuples of numbers.
+        section: of the configuration, for the message.
+        intervals: for each setting.
+
+    Raises:
+        UserError: a number lies outside, or is none.
+    """
+    for name, interval in intervals.items():
+        low, high = (float(bound) for bound in interval[1:-1].split(","))
+        setting = getattr(config, name)
+        for value in setting if isinstance(setting, tuple) else (setting,):
+            above = value > low or (interval[0] == "[" and value == low)
+            below = value < high or (interval[-1] == "]" and value == high)
+            if not (above and below):
+                raise UserError(f"{section}: {name} must be {_in_words(interval, low, high)}, not {value}")
+
+
+def _in_words(interval: str, low: float, high: float) -> str:
+    if high < float("inf"):
+        return f"in {interval}"
+    return f"{'at least' if interval[0] == '[' else 'above'} {low:g}"
 
 
 @dataclass(frozen=True)
@@ -23,6 +52,14 @@ class CollectConfig:
     """Environments stepped at once."""
     shard_episodes: int = 1000
     """Episodes in one Parquet file: the unit in which collection is resumed."""
+
+    def __post_init__(self) -> None:
+        """Check every number."""
+        counts = dict.fromkeys(("crossing_episodes", "following_episodes"), "[0, inf)")
+        sizes = dict.fromkeys(("num_envs", "shard_episodes"), "[1, inf)")
+        check_ranges(self, "collect", **counts, **sizes, following_mixture="[0, 1]")
+        if not self.crossing_episodes + self.following_episodes:
+            raise UserError("collect: no episodes to collect; set crossing_episodes or following_episodes")
 
 
 @dataclass(frozen=True)
@@ -63,6 +100,14 @@ class TrainConfig:
     device: str = "cpu"
     """Where to train: `cpu`, `cuda`, `cuda:1`, ..."""
 
+    def __post_init__(self) -> None:
+        """Check every number."""
+        sizes = dict.fromkeys(("epochs", "batch_size", "searches"), "[1, inf)")
+        weights = dict.fromkeys(("kl_weight", "time_limit"), "[0, inf)")
+        rates = {"learning_rate": "(0, inf)", "learning_rate_decay": "(0, 1]", "temperature": "(0, inf)"}
+        whole = {"max_parents": "[1, 5]", "named_factors": "[0, 8]"}
+        check_ranges(self, "train", **sizes, **weights, **rates, **whole, held_out="[0, 1)")
+
 
 @dataclass(frozen=True)
 class ExtractConfig:
@@ -76,3 +121,7 @@ class ExtractConfig:
     """Most parents from slice t where they are chosen by score."""
     prior_count: float = 1.0
     """Transitions that the Dirichlet prior of a row counts as when rows are counted from experience."""
+
+    def __post_init__(self) -> None:
+        """Check every number."""
+        check_ranges(self, "extract", max_parents="[1, 5]", prior_count="(0, inf)")

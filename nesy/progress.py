@@ -125,10 +125,10 @@ class _LineTask:
         self.printed = time.monotonic()
         seconds = max(self.printed - self.started, 1e-9)
         rate = self.done / seconds
-        left = (self.total - self.done) / rate if rate > 0 else float("inf")
+        left = f", {(self.total - self.done) / rate:.0f} s left" if self.done else ""
         print(
             f"{self.description}: {self.done}/{self.total}  {_rate(rate)}  "
-            f"{seconds:.0f} s, {left:.0f} s left  {_metrics(self.metrics)}".rstrip(),
+            f"{seconds:.0f} s{left}  {_metrics(self.metrics)}".rstrip(),
             file=sys.stderr,
             flush=True,
         )

@@ -52,9 +52,9 @@ def build_player(
         agent = _reference(cell, domain, own_seed)
         if not config.rules:
             return Built(Player(agent), None, 0)
-        codec = _codec(run)  # only to tell in which situation a rule applies
+        codec = load_codec(run)  # only to tell in which situation a rule applies
         return Built(Player(agent, None, action_mask(config, codec, domain), codec), None, 0)
-    codec = _codec(run)
+    codec = load_codec(run)
     mask = action_mask(config, codec, domain)
     if cell.agent in settings.PLANNING_AGENTS:
         perception = Perception(codec, cell.influence, np.random.default_rng([own_seed, 1]))
@@ -82,7 +82,7 @@ def restored_player(cell: Cell, run: RunFolder, domain: Domain, config: CompareC
     """
     if cell.agent in (*settings.REFERENCE_AGENTS, *settings.PLANNING_AGENTS):
         return build_player(cell, run, domain, config, seed).player
-    codec = _codec(run)
+    codec = load_codec(run)
     path = Path(cell.policy) if cell.policy else run.policies / f"{cell.name}.safetensors"
     return _stored(cell, path, codec, action_mask(config, codec, domain), cell_seed(cell, seed)).player
 
@@ -101,7 +101,7 @@ def agent_from_file(path: Path, run: RunFolder | None = None) -> tuple[DQNAgent,
     from planners.published import dqn_perception
 
     policy = DQNPolicy.load(path)
-    codec = _codec(run or RunFolder(path.resolve().parent.parent))
+    codec = load_codec(run or RunFolder(path.resolve().parent.parent))
     influence = str(policy.trained.get("influence", "perspective-shift"))
     return DQNAgent(policy), dqn_perception(codec, influence, np.random.default_rng(0), policy.config)
 
@@ -120,7 +120,8 @@ def cell_seed(cell: Cell, seed: int) -> int:
     return int(np.random.SeedSequence([seed, cell.seed, *cell.name.encode()]).generate_state(1)[0])
 
 
-def _codec(run: RunFolder) -> Codec:
+def load_codec(run: RunFolder) -> Codec:
+    """What turns views into codes, by the run's world model."""
     from nesy.world_model import SymbolicCodec, load_world_model
 
     return SymbolicCodec(load_world_model(run.world_model))

@@ -63,23 +63,8 @@ def grid(config: CompareConfig) -> list[Cell]:
     """All cells, in the order of the table.
 
     Raises:
-        UserError: an unknown agent, input set or influence mode, or none at all; a policy that cannot be read.
+        UserError: a policy that cannot be read.
     """
-    for name, chosen, known in (
-        ("agent", config.agents, settings.AGENTS),
-        ("input set", config.inputs, settings.INPUT_SETS),
-        ("influence mode", config.influences, settings.INFLUENCE_MODES),
-    ):
-        for item in chosen:
-            if item not in known:
-                raise UserError(f"unknown {name} '{item}' (known: {', '.join(known)})")
-    if not (config.agents or config.policies):
-        raise UserError("nothing to compare: the lists of agents and of policies are empty")
-    for name, values in (("variants", config.variants), ("seeds", config.seeds)):
-        if not values:
-            raise UserError(f"nothing to compare: the list of {name} is empty")
-    if min(config.episodes, config.planner_episodes) < 1:
-        raise UserError("at least one evaluation episode is needed")
     cells = []
     for variant in config.variants:
         for agent in config.agents:

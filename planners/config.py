@@ -8,6 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from nesy.config import check_ranges
+from nesy.errors import UserError
+
 INFLUENCE_MODES = ("zero", "random", "egocentric", "perspective-shift", "perfect-information")
 INPUT_SETS = ("paper", "full")
 LEARNING_AGENTS = ("dqn",)
@@ -83,6 +86,21 @@ class DQNConfig:
     published_occlusion: bool = False
     """As the published code: perfect information has the person unable to look through walls."""
 
+    def __post_init__(self) -> None:
+        """Check every number."""
+        sizes = ("episodes", "num_envs", "batch_size", "memory", "hidden", "n_step")
+        positive = ("learning_rate", "updates_per_step", "epsilon_decay", "gradient_clip", "reward_scale")
+        others = ("final_learning_rate", "warm_up", "target_period", "checkpoint_seconds")
+        shares = ("discount", "epsilon_start", "epsilon_end", "tau")
+        check_ranges(
+            self,
+            "dqn",
+            **dict.fromkeys(sizes, "[1, inf)"),
+            **dict.fromkeys(positive, "(0, inf)"),
+            **dict.fromkeys(others, "[0, inf)"),
+            **dict.fromkeys(shares, "[0, 1]"),
+        )
+
     @classmethod
     def paper(cls, episodes: int = 10_000) -> DQNConfig:
         """The settings of the paper: one environment, one update per step."""
@@ -156,6 +174,18 @@ class SearchConfig:
     pomdp_py_simulations: int = 150
     """Simulations per decision of pomdp-py's POUCT, which is far slower per simulation."""
 
+    def __post_init__(self) -> None:
+        """Check every number."""
+        sizes = ("simulations", "pomdp_py_simulations", "depth", "mind_depth", "particles", "practice_episodes")
+        check_ranges(
+            self,
+            "search",
+            **dict.fromkeys(sizes, "[1, inf)"),
+            **dict.fromkeys(("time_limit", "exploration", "mind_exploration"), "[0, inf)"),
+            **dict.fromkeys(("discount", "mind_discount"), "[0, 1)"),
+            practice_mixture="[0, 1]",
+        )
+
     def time_left(self, spent: float) -> float:
         """What is left for a search of a decision that has taken `spent` seconds already; 0 where there is no limit."""
         return max(self.time_limit - spent, 1e-6) if self.time_limit > 0 else 0.0
@@ -194,6 +224,32 @@ class CompareConfig:
     """How the DQN learns."""
     search: SearchConfig = field(default_factory=SearchConfig)
     """How the planners search."""
+
+    def __post_init__(self) -> None:
+        """Check every name and number; whether a domain has the variants is its own to say."""
+        for name, chosen, known in (
+            ("agent", self.agents, AGENTS),
+            ("input set", self.inputs, INPUT_SETS),
+            ("influence mode", self.influences, INFLUENCE_MODES),
+        ):
+            for item in chosen:
+                if item not in known:
+                    raise UserError(f"unknown {name} '{item}' (known: {', '.join(known)})")
+        for name in ("agents", "inputs", "influences", "variants", "seeds"):
+            values = getattr(self, name)
+            if not values and not (name == "agents" and self.policies):
+                raise UserError(f"nothing to compare: the list of {name} is empty")
+            if len(set(values)) < len(values):
+                raise UserError(f"compare: {name} names something twice: {', '.join(map(str, values))}")
+        check_ranges(
+            self,
+            "compare",
+            seeds="[0, inf)",
+            episodes="[1, inf)",
+            planner_episodes="[1, inf)",
+            confidence="(0, 1)",
+            planner_milliseconds="[0, inf)",
+        )
 
     @property
     def search_of_cells(self) -> SearchConfig:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from nesy.cli import pipeline, tables
-from nesy.run_folder import read_json
+from nesy.run_folder import RunFolder, read_json
 from planners.config import CompareConfig
 
 
@@ -30,11 +30,28 @@ def defaults(arguments: list[str]) -> Arguments:
 
 def run(options: Arguments) -> dict[str, Any]:
     """Run the cells of the grid that the run folder does not hold yet."""
+    if options.settings.rules:
+        check_rules(options)
     with pipeline.opened(options, "compare", compare=options.settings) as steps:
         result = steps.compare(options.engine, options.address)
         result["left_out"] = read_json(steps.run.results / "statistics.json")["left_out"]
         path = steps.run.results / "influence_rules.json"
         return result | ({"influence_rules": read_json(path)} if path.is_file() else {})
+
+
+def check_rules(options: Arguments) -> None:
+    """Ground the rule files on the run's codes before they become part of its configuration.
+
+    Raises:
+        UserError: a rule is wrong; the run has no world model yet.
+    """
+    from domains.core import load_domain
+    from planners.cells import action_mask, load_codec
+
+    run = RunFolder.open(options.run)
+    run.require("collect", "train", "extract")
+    domain = load_domain(pipeline.config_of(options).domain)
+    action_mask(options.settings, load_codec(run), domain)
 
 
 def show(result: dict[str, Any]) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from nesy.config import CollectConfig, ExtractConfig, TrainConfig
+from nesy.config import CollectConfig, ExtractConfig, TrainConfig, check_ranges
 from nesy.errors import UserError
 from nesy.run_folder import read_json, write_json
 from planners.config import CompareConfig, DQNConfig, SearchConfig
@@ -39,6 +39,10 @@ class RunConfig:
     """2DBN."""
     compare: CompareConfig = field(default_factory=CompareConfig)
     """Comparison."""
+
+    def __post_init__(self) -> None:
+        """Check the seed; the sections check themselves."""
+        check_ranges(self, "run", seed="[0, inf)")
 
 
 PRESETS: dict[str, RunConfig] = {
@@ -101,7 +105,11 @@ def _build(kind: type, value: Any, where: str) -> Any:
     unknown = sorted(set(value) - set(names))
     if unknown:
         raise UserError(f"{where}: unknown setting '{unknown[0][:80]}' (known: {', '.join(names)})")
-    return kind(**{name: _convert(types_of[name], value[name], f"{where}: {name}") for name in names if name in value})
+    settings = {name: _convert(types_of[name], value[name], f"{where}: {name}") for name in names if name in value}
+    try:
+        return kind(**settings)
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from None
 
 
 def _convert(kind: Any, value: Any, where: str) -> Any:

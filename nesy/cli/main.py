@@ -12,6 +12,7 @@ import importlib
 import io
 import json
 import os
+import re
 import signal
 import sys
 from collections.abc import Sequence
@@ -124,17 +125,18 @@ def parse(command: Any, program: str, arguments: list[str]) -> Any:
     except SystemExit as stop:
         if not stop.code:
             raise
-        raise UserError(f"{_first_paragraph(complaint.getvalue())} (see: {program} --help)") from None
+        said = re.sub(r"^Error parsing [\w.]+: ", "", _first_paragraph(complaint.getvalue()))
+        said = said.replace("'None', ", "").replace(", 'None'", "")  # nobody types that
+        raise UserError(f"{said} (see: {program} --help)") from None
 
 
 def _first_paragraph(box: str) -> str:
-    """What tyro says inside its frame, up to the first rule, as one line."""
+    """What tyro says below the title of its frame, up to the first rule, as one line; where standard output is not
+    UTF-8 the frame is of plain characters."""
     words: list[str] = []
-    for line in box.splitlines():
+    for line in box.splitlines()[1:]:
         text = line.strip().strip("│").strip()
-        if line.lstrip().startswith("╭"):
-            continue
-        if not text or set(text) <= set("─╰╯"):
+        if not text or set(text) <= set("─╰╯-"):
             if words:
                 break
             continue

@@ -113,8 +113,11 @@ def opened(options: CommonArguments, step: str, **sections: Any) -> Iterator[Pip
         sections: the configuration's sections that the command's options set.
 
     Raises:
-        UserError: the folder is missing, locked, or holds steps made with other settings.
+        UserError: the folder is missing, locked, or holds steps made with other settings; a setting cannot be met.
+            Then nothing has been written.
     """
+    if options.run.exists() and not options.run.is_dir():
+        raise UserError(f"{options.run}: is a file; a run is a folder")
     if step != next(iter(OUTPUTS)):
         RunFolder.open(options.run)
     base = config_of(options)
@@ -125,9 +128,23 @@ def opened(options: CommonArguments, step: str, **sections: Any) -> Iterator[Pip
         **sections,
     )
     pipeline = Pipeline(options.run, config, options.jobs)
+    _check_names(config)
     with pipeline.run.lock():
         pipeline.configure(redo_from=step if options.redo else None)
         yield pipeline
+
+
+def _check_names(config: RunConfig) -> None:
+    """Whether the variants are the domain's, and the files that a comparison reads are there."""
+    from domains.core import load_domain
+
+    known = load_domain(config.domain).spec.variants
+    for variant in (config.variant, *config.compare.variants):
+        if variant not in known:
+            raise UserError(f"unknown variant '{variant}' (known: {', '.join(known)})")
+    for path in (*config.compare.rules, *config.compare.policies):
+        if not Path(path).is_file():
+            raise UserError(f"{path}: no such file")
 
 
 class Pipeline:
@@ -147,8 +164,6 @@ class Pipeline:
         Raises:
             UserError: a finished step was made with other settings and is not to be redone.
         """
-        if self.run.path.exists() and not self.run.path.is_dir():
-            raise UserError(f"{self.run.path}: is a file; a run is a folder")
         if redo_from is not None:
             self._remove_from(redo_from)
         if self.run.has("config"):

@@ -162,18 +162,6 @@ def _references(domain: Domain, variant: str) -> dict[str, Transitions]:
 def _check(config: TrainConfig) -> None:
     if config.architecture not in ARCHITECTURES:
         raise UserError(f"unknown architecture '{config.architecture}'; known: {', '.join(ARCHITECTURES)}")
-    positive = {"epochs": config.epochs, "batch_size": config.batch_size, "learning_rate": config.learning_rate}
-    for name, value in positive.items():
-        if not value > 0:
-            raise UserError(f"training: {name} must be positive, not {value}")
-    if not 1 <= config.max_parents <= 5:
-        raise UserError(f"training: max_parents must be from 1 to 5, not {config.max_parents}")
-    if not 0 <= config.named_factors <= 8:
-        raise UserError(f"training: named_factors must be from 0 to 8, not {config.named_factors}")
-    if config.searches < 1:
-        raise UserError(f"training: searches must be at least 1, not {config.searches}")
-    if not 0 <= config.held_out < 1:
-        raise UserError(f"training: held_out must be in [0, 1), not {config.held_out}")
     try:
         torch.empty(1, device=config.device)
     except (RuntimeError, AssertionError) as error:

@@ -40,6 +40,12 @@ def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]
         (["run", "--preset", "fast"], "fast"),
         (["train", "--seed", "x"], "--seed"),
         (["collect", "--jobs", "0"], "at least one process"),
+        (["run", "--seed", "-1"], "seed must be at least 0"),
+        (["run", "--variant", "bogus"], "unknown variant 'bogus' (known: paper, clean"),
+        (["run", "--collect.num-envs", "0"], "nesy: collect: num_envs must be at least 1, not 0"),
+        (["run", "--compare.dqn.hidden", "64", "0"], "hidden must be at least 1"),
+        (["run", "--compare.search.discount", "1"], "discount must be in [0, 1)"),
+        (["run", "--compare.rules", "gone.lp"], "gone.lp: no such file"),
         (["query"], "ask one question"),
         (["query", "--means", "3=5", "--changes", "left"], "ask one question"),
     ],
@@ -58,6 +64,13 @@ def test_wrong_command_line(
     assert expected in printed.err
     assert len(printed.err.strip().splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_is_no_run_folder(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    path.touch()
+    assert main(["run", "--run", str(path)]) == 2
+    assert "is a file; a run is a folder" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["train", "extract", "compare", "report", "query --vocabulary"])
@@ -107,6 +120,8 @@ def test_configuration_round_trip(preset: str, tmp_path: Path) -> None:
         ({"train": {"epochs": 1.5}}, "epochs: expected int"),
         ({"train": []}, "expected an object"),
         ({"compare": {"agents": "dqn"}}, "expected a list"),
+        ({"compare": {"agents": ["dqm"]}}, r"config\.json: compare: unknown agent 'dqm'"),
+        ({"compare": {"confidence": 1.0}}, "confidence must be in"),
     ],
 )
 def test_damaged_configuration(change: dict[str, object], expected: str, tmp_path: Path) -> None:

@@ -133,6 +133,32 @@ def test_other_settings_for_a_finished_step_are_refused(run: Path, capsys: pytes
     assert (run / "config.json").read_bytes() == before
 
 
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--agents", "dqm"], "unknown agent 'dqm'"),
+        (["--variants", "bogus"], "unknown variant 'bogus'"),
+        (["--seeds", "0", "0"], "seeds names something twice"),
+        (["--dqn.episodes", "0"], "episodes must be at least 1"),
+        (["--rules", "wrong.lp"], "wrong.lp:1:"),
+    ],
+)
+def test_a_mistaken_comparison_leaves_the_run_as_it_was(
+    options: list[str],
+    expected: str,
+    run: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("wrong.lp").write_text("forbidden(forward :- now(wall_ahead).")
+    before = (run / "config.json").read_bytes()
+    assert main(["compare", "--run", str(run), *options]) == 2
+    assert expected in _error(capsys)
+    assert (run / "config.json").read_bytes() == before
+
+
 def test_json_is_one_object_on_standard_output(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["extract", "--run", str(run), "--json"]) == 0
     assert "rows" in json.loads(capsys.readouterr().out)
