@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from domains.core import GOAL, WALL
+from domains.core import EMPTY, GOAL, WALL
 from nesy.errors import UserError
 from planners.frames import Frame, learn_frame, reckon
 from planners.ialm import TIMEOUT, WAIT, Codec
 from planners.intentions import learn_intentions
 from planners.minds import MAX_STANDING, MAX_WALK, MOVES, STEP, MindModel, move_variables
-from planners.motion import FORWARD, STAY
+from planners.motion import FORWARD, NUM_HEADINGS, STAY
 from planners.scenes import Scenes, learn_scenes
 from planners.tables import DecisionTable, Parents, learn_distribution, learn_mean
 
@@ -25,9 +25,20 @@ HORIZON = 64
 
 
 def several_goals(experience: Experience) -> bool:
-    """Whether some map has shown more goals than one at a time: only then there is something to intend."""
+    """Whether there is something to intend: some view shows more goals than one, or a goal goes before a robot's eyes.
+
+    A goal that the person steps on is only hidden. Robots that stay see what becomes of the goals in view.
+    """
     shown = (experience.view == GOAL).reshape(len(experience), -1).sum(1)
-    return bool((shown > 1).any())
+    if (shown > 1).any():
+        return True
+    stays = np.flatnonzero(experience.action == STAY)
+    gone = (experience.view[stays] == GOAL) & (experience.next_view[stays] == EMPTY)
+    gone = gone.reshape(len(stays), experience.view[0].size)
+    configuration = experience.next_configuration[stays].astype(np.int64)
+    seen = configuration > 0
+    gone[seen, (configuration[seen] - 1) // NUM_HEADINGS] = False
+    return bool(gone.any())
 
 
 def learn_minds(codec: Codec, experience: Experience, provenance: dict[str, Any] | None = None) -> MindModel:
@@ -38,7 +49,7 @@ def learn_minds(codec: Codec, experience: Experience, provenance: dict[str, Any]
         experience: transitions of person following (all tables), and walks over its maps (scenes only).
         provenance: recorded with the model.
     """
-    following = _whole(experience.select(np.char.startswith(experience.source, "following")))
+    following = whole_episodes(experience.select(np.char.startswith(experience.source, "following")))
     if len(following) == 0:
         raise UserError("the experience holds no person-following episodes; collect some (sources following-*)")
     frame, moved = learn_frame(following)
@@ -57,7 +68,7 @@ def learn_minds(codec: Codec, experience: Experience, provenance: dict[str, Any]
     )
     maps, seen_from, seen = [following.map_id] * 2, [poses, people], [following.view, following.person_view]
     begins = [t == 0, np.zeros(len(t), np.bool_)]
-    exploring = _whole(_some(experience, np.isin(experience.map_id, np.unique(following.map_id))))
+    exploring = whole_episodes(_some(experience, np.isin(experience.map_id, np.unique(following.map_id))))
     if len(exploring):
         maps.append(exploring.map_id)
         seen_from.append(_explored(frame, exploring, moves))
@@ -94,7 +105,7 @@ def learn_minds(codec: Codec, experience: Experience, provenance: dict[str, Any]
     )
 
 
-def _whole(experience: Experience) -> Experience:
+def whole_episodes(experience: Experience) -> Experience:
     """The episodes that are there from their first step on, in order."""
     order = np.lexsort((experience.t, experience.episode))
     experience = experience.select(order)

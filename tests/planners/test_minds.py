@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -331,5 +332,18 @@ def test_several_goals_are_noticed(moving: tuple[Experience, MindModel]) -> None
     experience = moving[0]
     assert several_goals(experience)
     alone = (experience.view == GOAL).reshape(len(experience), -1).sum(1) < 2
-    assert not several_goals(experience.select(alone))
+    following = np.char.startswith(experience.source, "following")
+    assert several_goals(experience.select(alone & following))  # one at a time, but it goes elsewhere
+    assert not several_goals(experience.select(alone & ~following))
     assert (experience.view == WALL).any()
+
+
+def test_a_goal_that_the_person_steps_on_has_not_moved(moving: tuple[Experience, MindModel]) -> None:
+    view, then = np.zeros((1, 5, 5), np.uint8), np.zeros((1, 5, 5), np.uint8)
+    view[0, 3, 1] = GOAL
+    step = replace(moving[0].select(np.array([0])), view=view, next_view=then)
+    for configuration, several in ((0, True), (1 + (3 * 5 + 1) * 4 + 2, False), (1 + (3 * 5 + 2) * 4, True)):
+        there = np.array([configuration], np.int16)
+        for action in (STAY, FORWARD):  # who moves sees other cells
+            found = several_goals(replace(step, action=np.array([action], np.int8), next_configuration=there))
+            assert found == (several and action == STAY)
