@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from domains.core import Domain
 from nesy.asp.shield import Advice, Fallback, Shield
+from nesy.asp.sources import Programs
 from nesy.errors import UserError
 
 _LOG = logging.getLogger(__name__)
@@ -61,7 +60,7 @@ class ShieldMask:
     """
 
     def __init__(
-        self, rules: Sequence[str | Path], codec: Decoder, domain: Domain, fallback: Fallback = "stay", **limits: Any
+        self, rules: Programs, codec: Decoder, domain: Domain, fallback: Fallback = "stay", **limits: Any
     ) -> None:
         self.codec, self.predicates = codec, domain.predicates
         self.num_configurations = domain.spec.geometry.num_configurations

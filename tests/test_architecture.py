@@ -56,6 +56,16 @@ def test_dependencies_flow_one_way(path: Path) -> None:
             assert not name.startswith("nesy.cli"), f"{path.relative_to(ROOT)} imports the command line"
 
 
+def test_submodules_are_found_when_they_are_asked_for() -> None:
+    code = (
+        "import nesy, planners, sys; assert 'torch' not in sys.modules; "
+        "nesy.formats.export; nesy.asp.KnowledgeBase; nesy.perspective.shift; planners.pomdp.TabularPOMDP; "
+        "assert not hasattr(nesy, 'nothing')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.parametrize("package", ["nesy", "planners", "domains", "nesy.cli.main", "planners.config"])
 def test_importing_is_cheap(package: str) -> None:
     heavy = ("torch", "numba", "clingo", "pomdp_py", "matplotlib", "sklearn", "scipy")

@@ -69,3 +69,20 @@ def test_numbers_too_large_for_a_table_are_refused(tmp_path: Path) -> None:
     pq.write_table(table.replace_schema_metadata({parquet.KEY: text, parquet.SUM: sha}), path)
     with pytest.raises(UserError, match="too large for a whole number"):
         read(path)
+
+
+def test_a_table_file_cannot_have_any_name(tmp_path: Path) -> None:
+    """A name with a null byte in a sealed model.json ended in a ValueError of `open`."""
+    import json
+
+    from nesy.dbn import TwoSliceDBN, storage
+
+    TwoSliceDBN.from_tables([[np.full((2, 2), 0.5)]], [[(0,)]]).save(tmp_path)
+    path = tmp_path / "model.json"
+    document = json.loads(path.read_text())
+    del document["checksum"]
+    for name in ("\0", "../tables.npz"):
+        document["tables"]["file"] = name
+        path.write_bytes(storage._seal(document))
+        with pytest.raises(UserError, match="names a table file outside its folder, or one that cannot be"):
+            TwoSliceDBN.load(tmp_path)

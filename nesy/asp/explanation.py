@@ -95,7 +95,7 @@ def explain_step(dbn: TwoSliceDBN, code: np.ndarray, action: int, next_code: np.
         UserError: a code or action of another model.
     """
     now = dbn._codes(code)
-    dbn._actions(action)
+    action = dbn.action_index(action)
     later = np.array(
         most_probable_next(dbn, now[None], action)[0][0] if next_code is None else next_code, dtype=np.int64
     )

@@ -16,7 +16,7 @@ import numpy as np
 from nesy.asp.finding import Edge, Finding, finding
 from nesy.asp.meaning_questions import MeaningQuestions
 from nesy.asp.solver import Answer, solve
-from nesy.asp.sources import read_sources
+from nesy.asp.sources import Programs, listed, read_sources
 from nesy.asp.step_questions import StepQuestions
 from nesy.dbn.codebook import Codebook
 from nesy.dbn.model import TwoSliceDBN
@@ -116,9 +116,7 @@ class KnowledgeBase(MeaningQuestions, StepQuestions):
         return finding("What does the person see?", "\n".join(lines), found.rows, started, found.support)
 
     # ---------------------------------------------------------------- people's rules
-    def allowed(
-        self, rules: Sequence[str | Path], code: Sequence[int], configuration: int = 0, **options: Any
-    ) -> Finding:
+    def allowed(self, rules: Programs, code: Sequence[int], configuration: int = 0, **options: Any) -> Finding:
         """Which actions do people's rules allow in one situation, and which rules forbid the others?
 
         Args:
@@ -161,7 +159,7 @@ class KnowledgeBase(MeaningQuestions, StepQuestions):
         columns = [self.book.predicate_names.index(name) for name in shield.predicates]
         return shield.advise(code, holds[0, columns], configuration)
 
-    def shield(self, rules: Sequence[str | Path], **options: Any) -> Shield:
+    def shield(self, rules: Programs, **options: Any) -> Shield:
         """An action mask from people's rules (see nesy.asp.shield.Shield, which also lists the options).
 
         Raises:
@@ -181,7 +179,7 @@ class KnowledgeBase(MeaningQuestions, StepQuestions):
         )
 
     def constrained(
-        self, rules: Sequence[str | Path], time_limit: float = 10.0, memory_mb: int = 2048
+        self, rules: Programs, time_limit: float = 10.0, memory_mb: int = 2048
     ) -> tuple[TwoSliceDBN, Removal]:
         """The model without the entries that rules call impossible, and what was removed.
 
@@ -205,7 +203,7 @@ class KnowledgeBase(MeaningQuestions, StepQuestions):
     def query(
         self,
         program: str | Path,
-        rules: Sequence[str | Path] = (),
+        rules: Programs = (),
         models: int = 1,
         time_limit: float = 10.0,
         memory_mb: int = 2048,
@@ -225,7 +223,7 @@ class KnowledgeBase(MeaningQuestions, StepQuestions):
         Raises:
             UserError: the program is wrong, or does not ground within its limits.
         """
-        sources = read_sources([program, *rules])
+        sources = read_sources([program, *listed(rules)])
         mentioned = self.facts.mentioned(*(source.text for source in sources))
         uses_weights = bool({"row", "dropped"} & set(mentioned))
         return solve(

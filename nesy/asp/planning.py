@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from nesy.asp.conditions import Literal, of_factor, parse_literals
 from nesy.asp.encoding import ENCODINGS, run_encoding
 from nesy.asp.facts import Facts, asp_name
 from nesy.asp.solver import solve
-from nesy.asp.sources import Source, read_sources
+from nesy.asp.sources import Programs, Source, read_sources
 from nesy.dbn.codebook import Codebook
 from nesy.dbn.inference import likely_next
 from nesy.dbn.model import TwoSliceDBN
@@ -96,7 +95,7 @@ def find_plan(
     start: np.ndarray,
     goal: str,
     max_steps: int = 12,
-    rules: Sequence[str | Path] = (),
+    rules: Programs = (),
     most_probable: bool = False,
     time_limit: float = 10.0,
     optimistic: bool = False,
@@ -133,7 +132,7 @@ def find_plan(
     codes, moves, distance = reachable(dbn, start, max_steps, truth, optimistic)
     good = satisfied(literals, codes, truth)
     left = _steps_left(moves, good, max_steps)
-    sources = read_sources(list(rules))
+    sources = read_sources(rules)
     first = int(distance[good].min(initial=max_steps + 1))
     best: tuple[float, list[int], list[int]] | None = None
     for horizon in range(first, max_steps + 1):

@@ -7,10 +7,10 @@ answered from memory. A shield that would leave no action says which rules confl
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import clingo
@@ -20,7 +20,7 @@ from clingo import ast
 from nesy.asp.encoding import ENCODINGS
 from nesy.asp.facts import asp_name
 from nesy.asp.solver import solve
-from nesy.asp.sources import Source, read_sources
+from nesy.asp.sources import Programs, Source, read_sources
 from nesy.errors import UserError
 
 Fallback = Literal["all", "stay", "error"]
@@ -42,6 +42,8 @@ class Role:
     """File under encodings/."""
 
 
+DERIVED = ("person_ahead", "person_visible")
+"""Predicates of the robot's view that shield.lp derives."""
 ROBOT = Role("at", "now", "forbidden", "preferred", "shield.lp")
 PERSON = Role("person_code", "person_now", "person_forbidden", "", "person.lp")
 
@@ -65,7 +67,7 @@ class Shield:
 
     def __init__(
         self,
-        rules: Sequence[str | Path],
+        rules: Programs,
         action_names: Sequence[str],
         num_factors: int,
         num_values: int,
@@ -104,7 +106,7 @@ class Shield:
             raise UserError(f"the fallback 'stay' needs an action '{stay}'; the actions are {', '.join(action_names)}")
         self.fallback, self._stay = fallback, stay
         self.view_size = view_size
-        self._sources = read_sources(list(rules))
+        self._sources, self._vocabulary = read_sources(rules), (*predicates, *DERIVED)
         self._size = (num_factors, num_values)
         words = " ".join(source.text for source in self._sources)
         # only what some rule mentions can matter
@@ -112,8 +114,43 @@ class Shield:
         self._uses_code = re.search(rf"\b{role.code}\s*\(", words) is not None
         labelled = [_labelled(source, role) for source in self._sources]
         programs = [*self._sources, self._encoding()]
-        solve(programs, self._situation_program(), (), time_limit=time_limit, memory_mb=memory_mb)
+        answer = solve(programs, self._situation_program(), (), time_limit=time_limit, memory_mb=memory_mb)
+        self._check_words(answer.notes)
         self._ground(labelled)
+        self._check_actions()
+
+    def _check_words(self, notes: Sequence[str]) -> None:
+        """A misspelt word would make a rule that never applies: what nothing defines is a mistake."""
+        other = PERSON if self.role == ROBOT else ROBOT
+        for note in notes:
+            place, undefined, atom = note.partition(": info: atom does not occur in any rule head: ")
+            name, _, argument = atom.partition("(")
+            if not undefined or name in (other.view, other.code):
+                continue
+            known = f"nothing makes {atom} true; #defined {name}/{atom.count(',') + 1}. if that is meant"
+            if name == self.role.view:
+                close = difflib.get_close_matches(argument.rstrip(")"), [asp_name(p) for p in self._vocabulary], n=1)
+                known = "no such predicate" + (f" (did you mean '{close[0]}'?)" if close else "")
+            raise UserError(f"{place}: {atom}: {known}")
+        words = " ".join(source.text for source in self._sources)
+        heads = [head for role in (ROBOT, PERSON) for head in (role.forbidden, role.preferred) if head]
+        if words.strip() and not re.search(rf"\b({'|'.join(heads)})\b", words):
+            name = self._sources[0].name
+            raise UserError(f"{name}: no rule has one of the heads {', '.join(heads)}; is one misspelt?")
+
+    def _check_actions(self) -> None:
+        """Whether what rules forbid or prefer are actions.
+
+        Raises:
+            UserError: one is not.
+        """
+        for head in filter(None, (self.role.forbidden, self.role.preferred)):
+            for atom in self._control.symbolic_atoms.by_signature(head, 1):
+                if str(atom.symbol.arguments[0]) not in self._actions:
+                    raise UserError(
+                        f"{self._sources[0].name}: {atom.symbol}: no such action; "
+                        f"the actions are {', '.join(self._actions)}"
+                    )
 
     @property
     def speaks(self) -> bool:

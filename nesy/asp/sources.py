@@ -13,6 +13,9 @@ from pathlib import Path
 
 from nesy.errors import UserError
 
+Programs = str | Path | Sequence[str | Path]
+"""One program or several: a `Path` is a file, a `str` is the text itself."""
+
 MAX_CHARACTERS = 10_000_000
 
 _TOKENS = re.compile(
@@ -36,20 +39,27 @@ class Source:
     text: str
 
 
-def read_sources(programs: Sequence[str | Path]) -> list[Source]:
+def listed(programs: Programs) -> list[str | Path]:
+    """Programs as a list, where one may be given by itself."""
+    return [programs] if isinstance(programs, str | Path) else list(programs)
+
+
+def read_sources(programs: Programs) -> list[Source]:
     """All program texts that `programs` consist of, included files among them.
 
     Args:
-        programs: a `Path` is read as a file, a `str` is program text itself.
+        programs: one or several; a `Path` is read as a file, a `str` is program text itself.
 
     Raises:
         UserError: a file is missing or no UTF-8 text, or a program has a script block or reaches outside.
     """
     found: list[Source] = []
     seen: set[Path] = set()
-    for number, program in enumerate(programs, 1):
+    for number, program in enumerate(listed(programs), 1):
         if isinstance(program, Path):
             _add_file(program, program.resolve().parent, found, seen)
+        elif program.endswith(".lp") and "\n" not in program:
+            raise UserError(f"'{program}' is taken for program text; name a file as Path({program!r})")
         else:
             name = "program" if number == 1 else f"program {number}"
             _add(Source(name, program), None, found, seen)

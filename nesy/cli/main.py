@@ -131,8 +131,10 @@ def parse(command: Any, program: str, arguments: list[str]) -> Any:
 
 
 def _first_paragraph(box: str) -> str:
-    """What tyro says below the title of its frame, up to the first rule, as one line; where standard output is not
-    UTF-8 the frame is of plain characters."""
+    """What tyro says below the title of its frame, up to the first rule, as one line.
+
+    The frame is of plain characters where standard output is not UTF-8.
+    """
     words: list[str] = []
     for line in box.splitlines()[1:]:
         text = line.strip().strip("│").strip()

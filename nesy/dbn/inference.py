@@ -36,7 +36,7 @@ def predict(dbn: TwoSliceDBN, belief: np.ndarray, action: int) -> np.ndarray:
         UserError: a wrong shape or action, or a model too densely connected for exact inference.
     """
     belief = check_belief(dbn, belief)
-    dbn._actions(action)
+    action = dbn.action_index(action)
     supports = [np.flatnonzero(row) for row in belief]
     result = np.empty(belief.shape)
     for i in range(dbn.num_factors):
@@ -64,7 +64,7 @@ def update(dbn: TwoSliceDBN, belief: np.ndarray, action: int, likelihood: np.nda
         UserError: a wrong shape or action, or a model too densely connected for exact inference.
     """
     belief = check_belief(dbn, belief)
-    dbn._actions(action)
+    action = dbn.action_index(action)
     likelihood = np.asarray(likelihood, dtype=np.float64)
     if likelihood.shape != belief.shape or not (likelihood >= 0).all():
         raise UserError(f"a likelihood has the shape {list(belief.shape)} and no negative entries")
@@ -112,7 +112,7 @@ def plan_marginals(
     n, k = dbn.num_factors, dbn.num_values
     start = np.asarray(start)
     belief = check_belief(dbn, np.eye(k)[dbn._codes(start)] if start.ndim == 1 else start)
-    dbn._actions(np.asarray(plan, dtype=np.int64))
+    plan = dbn.action_indices(plan).tolist()
     evidence = evidence or {}
     needed: list[set[int]] = [set() for _ in range(len(plan) + 1)]
     needed[-1] = set(factors)
@@ -156,7 +156,7 @@ def joint_next(dbn: TwoSliceDBN, code: np.ndarray, action: int, drop: float = 0.
         UserError: there are more than 4 million of them.
     """
     now = dbn._codes(code)
-    dbn._actions(action)
+    action = dbn.action_index(action)
     later = np.zeros((1, dbn.num_factors), dtype=np.int64)
     weights = np.ones(1)
     for i in dbn.order:
@@ -188,7 +188,7 @@ def likely_next(dbn: TwoSliceDBN, codes: np.ndarray, action: int, beam: int = 16
         uint8 [B, W, N] with W <= beam, most probable first, and their probabilities float64 [B, W].
     """
     now = dbn._codes(codes)
-    dbn._actions(action)
+    action = dbn.action_index(action)
     later = np.zeros((len(now), 1, dbn.num_factors), dtype=np.int64)
     weights = np.ones((len(now), 1))
     row_number = np.arange(len(now))[:, None]

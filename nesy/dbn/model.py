@@ -233,7 +233,7 @@ class TwoSliceDBN:
         return row
 
     # ---------------------------------------------------------------- inference
-    def log_prob(self, code: np.ndarray, action: int | np.ndarray, next_code: np.ndarray) -> np.ndarray:
+    def log_prob(self, code: np.ndarray, action: int | str | np.ndarray, next_code: np.ndarray) -> np.ndarray:
         """Log-probability T(x' | x, a) in nats, of one transition or many.
 
         Args:
@@ -245,7 +245,7 @@ class TwoSliceDBN:
             float64 [...]; -inf where the transition is impossible.
         """
         codes, next_codes = np.broadcast_arrays(self._codes(code), self._codes(next_code))
-        actions = np.broadcast_to(self._actions(action), codes.shape[:-1])
+        actions = np.broadcast_to(self.action_indices(action), codes.shape[:-1])
         result = np.zeros(codes.shape[:-1])
         for a in np.unique(actions):
             chosen = actions == a
@@ -257,7 +257,7 @@ class TwoSliceDBN:
             result[chosen] = total
         return result
 
-    def sample(self, code: np.ndarray, action: int | np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def sample(self, code: np.ndarray, action: int | str | np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Draw x' ~ T(. | x, a), for one code or many.
 
         Args:
@@ -269,7 +269,7 @@ class TwoSliceDBN:
             uint8 [..., N].
         """
         codes = self._codes(code)
-        actions = np.broadcast_to(self._actions(action), codes.shape[:-1])
+        actions = np.broadcast_to(self.action_indices(action), codes.shape[:-1])
         uniforms = rng.random(codes.shape)
         result = np.zeros(codes.shape, dtype=np.uint8)
         for a in np.unique(actions):
@@ -283,25 +283,25 @@ class TwoSliceDBN:
             result[chosen] = later
         return result
 
-    def predict(self, belief: np.ndarray, action: int) -> np.ndarray:
+    def predict(self, belief: np.ndarray, action: int | str) -> np.ndarray:
         """Exact marginals of the next factors, the factors being independent now.
 
         Args:
             belief: [N, K], rows sum to 1.
-            action: the action.
+            action: the action, by number or name.
 
         Returns:
             float64 [N, K].
         """
         from nesy.dbn.inference import predict
 
-        return predict(self, belief, action)
+        return predict(self, belief, self.action_index(action))
 
-    def filter(self, belief: np.ndarray, action: int, likelihood: np.ndarray) -> np.ndarray:
+    def filter(self, belief: np.ndarray, action: int | str, likelihood: np.ndarray) -> np.ndarray:
         """Exact posterior marginals after an action and an observation (see nesy.dbn.inference.update)."""
         from nesy.dbn.inference import update
 
-        return update(self, belief, action, likelihood)
+        return update(self, belief, self.action_index(action), likelihood)
 
     def to_networkx(self, action: int | None = None) -> networkx.MultiDiGraph:
         """The graph: nodes `X0` (slice t) and `X0'` (slice t+1); an edge per action and parent.
@@ -340,11 +340,31 @@ class TwoSliceDBN:
             raise UserError(f"a code's values lie in 0..{self.num_values - 1}")
         return codes.astype(np.int64)
 
-    def _actions(self, action: int | np.ndarray) -> np.ndarray:
-        actions = np.asarray(action)
-        if actions.size and (actions.min() < 0 or actions.max() >= self.num_actions):
-            raise UserError(f"an action lies in 0..{self.num_actions - 1}")
-        return actions
+    def action_indices(self, actions: int | str | Sequence[int | str] | np.ndarray) -> np.ndarray:
+        """Actions as int64 [...], given as numbers or by their names.
+
+        Raises:
+            UserError: no such action.
+        """
+        given = np.asarray(actions)
+        if given.dtype.kind == "U":
+            places = {name: a for a, name in enumerate(self.action_names)}
+            given = np.array([places.get(str(name), -1) for name in given.reshape(-1)], np.int64).reshape(given.shape)
+        if given.size and (given.dtype.kind not in "iu" or given.min() < 0 or given.max() >= self.num_actions):
+            known = ", ".join(self.action_names)
+            raise UserError(f"an action lies in 0..{self.num_actions - 1} or is one of {known}; found {actions!r}")
+        return given.astype(np.int64)
+
+    def action_index(self, action: int | str) -> int:
+        """One action as a number, given as that or by its name.
+
+        Raises:
+            UserError: no such action.
+        """
+        found = self.action_indices(action)
+        if found.ndim:
+            raise UserError(f"one action is needed, not {action!r}")
+        return int(found)
 
 
 def topological_order(parents_next: Parents, num_factors: int) -> tuple[int, ...]:

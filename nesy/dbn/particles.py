@@ -85,7 +85,7 @@ class ParticleFilter:
         Raises:
             UserError: no such action, or likelihoods of a wrong shape or sign.
         """
-        self.dbn._actions(action)
+        action = self.dbn.action_index(action)
         number = len(belief.codes)
         uniforms = rng.random(belief.codes.shape)
         codes = sample_codes(self._tables, belief.codes, np.full(number, action), uniforms)

@@ -62,8 +62,8 @@ def load(folder: Path, name: str, kind: str) -> tuple[dict[str, Any], dict[str, 
     document = _read_sealed(path, kind)
     reference = document["tables"]
     tables_path = Path(folder) / str(reference["file"])
-    if tables_path.parent != Path(folder):
-        raise UserError(f"{path}: names a table file outside its folder")
+    if tables_path.parent != Path(folder) or not tables_path.name.isprintable():
+        raise UserError(f"{path}: names a table file outside its folder, or one that cannot be")
     content = _read_bytes(tables_path)
     if hashlib.sha256(content).hexdigest() != reference["sha256"]:
         raise UserError(f"{tables_path}: damaged or from another model (its checksum differs from {path.name})")

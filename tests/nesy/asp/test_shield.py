@@ -72,9 +72,34 @@ def test_a_conflict_names_its_rules_and_falls_back():
         make(rules, fallback="error").advise(CODE, truth, 0)
 
 
+@pytest.mark.parametrize(
+    ("rules", "message"),
+    [
+        ("forbidden(foward) :- now(wall_ahead).", r"forbidden\(foward\): no such action; the actions are left, right"),
+        ("bad(fly). preferred(A) :- bad(A).", r"preferred\(fly\): no such action"),
+        (
+            "forbidden(forward) :- now(wal_ahead).",
+            r"program:1:23-37: now\(wal_ahead\): no such predicate \(did",
+        ),
+        ("forbidden(forward) :- not nox(wall_ahead,2).", r"nothing makes nox\(wall_ahead,2\) true; #defined nox/2\."),
+        ("forbiden(forward) :- now(wall_ahead).", "no rule has one of the heads forbidden, preferred"),
+    ],
+)
+def test_a_misspelt_word_is_no_rule_that_never_applies(rules: str, message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        make(rules)
+
+
+def test_words_about_the_person_and_declared_ones_are_known() -> None:
+    make(
+        "person_forbidden(forward) :- person_now(wall_ahead), person_code(3,5). "
+        "#defined tired/0. forbidden(left) :- tired."
+    )
+
+
 def test_rules_that_contradict_each_other_are_an_error():
     with pytest.raises(UserError, match="contradict"):
-        make(":- now(wall_ahead).").advise(CODE, np.array([True]), 0)
+        make("forbidden(left) :- now(wall_ahead). :- forbidden(left).").advise(CODE, np.array([True]), 0)
 
 
 @pytest.mark.parametrize(

@@ -171,3 +171,19 @@ def test_batched_filter_agrees_with_the_exact_one_on_independent_factors_and_has
     fallen = FactoredUpdates(dbn).filter(beliefs, actions, likelihoods)
     np.testing.assert_allclose(fallen[b, i], np.eye(3)[k])
     np.testing.assert_allclose(fallen[b, (i + 1) % 3], predicted[b, (i + 1) % 3])
+
+
+def test_actions_may_be_named():
+    dbn = random_dbn(np.random.default_rng(4))
+    belief = np.full((dbn.num_factors, dbn.num_values), 1.0 / dbn.num_values)
+    code = np.zeros(dbn.num_factors, dtype=np.int64)
+    for a, name in enumerate(dbn.action_names):
+        assert np.array_equal(dbn.predict(belief, name), dbn.predict(belief, a))
+        assert np.array_equal(dbn.filter(belief, name, belief), dbn.filter(belief, a, belief))
+        assert dbn.log_prob(code, name, code) == dbn.log_prob(code, a, code)
+        assert np.array_equal(
+            dbn.sample(code, name, np.random.default_rng(0)), dbn.sample(code, a, np.random.default_rng(0))
+        )
+    for action in ("fly", -1, 1.5, [0, 1]):
+        with pytest.raises(UserError, match="action"):
+            dbn.predict(belief, action)
