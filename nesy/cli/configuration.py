@@ -109,7 +109,8 @@ def _build(kind: type, value: Any, where: str) -> Any:
     try:
         return kind(**settings)
     except UserError as error:
-        raise UserError(f"{where}: {error}") from None
+        path = where.partition(": ")[0]  # the error names the section
+        raise UserError(f"{path}: {error}") from None
 
 
 def _convert(kind: Any, value: Any, where: str) -> Any:

@@ -6,6 +6,7 @@ predicates on every view, all that a question about meaning needs: no network an
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -84,8 +85,11 @@ class Codebook:
             UserError: there is no such predicate.
         """
         if name not in self.predicate_names:
-            known = ", ".join(self.predicate_names)
-            raise UserError(f"no predicate '{name}'; the predicates are {known}")
+            close = difflib.get_close_matches(name, self.predicate_names, n=3, cutoff=0.5) or self.predicate_names[:3]
+            raise UserError(
+                f"no predicate '{name}'; there are {len(self.predicate_names)}, among them {', '.join(close)} "
+                "(all of them: nesy query --vocabulary)"
+            )
         return np.asarray(self.predicates[:, self.predicate_names.index(name)])
 
     def distinct_codes(self) -> tuple[np.ndarray, np.ndarray]:

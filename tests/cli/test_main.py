@@ -120,7 +120,7 @@ def test_configuration_round_trip(preset: str, tmp_path: Path) -> None:
         ({"train": {"epochs": 1.5}}, "epochs: expected int"),
         ({"train": []}, "expected an object"),
         ({"compare": {"agents": "dqn"}}, "expected a list"),
-        ({"compare": {"agents": ["dqm"]}}, r"config\.json: compare: unknown agent 'dqm'"),
+        ({"compare": {"agents": ["dqm"]}}, r"config\.json: unknown agent 'dqm'"),
         ({"compare": {"confidence": 1.0}}, "confidence must be in"),
     ],
 )
