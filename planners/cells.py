@@ -14,7 +14,7 @@ from nesy.run_folder import RunFolder
 from planners import config as settings
 from planners.agents import Agent, DQNAgent, PlanningAgent
 from planners.baselines import LastSeenFollower, OptimalAgent, OracleFollower, RandomAgent
-from planners.config import CompareConfig
+from planners.config import CompareConfig, SearchConfig
 from planners.evaluation import Columns, Player
 from planners.perception import Codec, Perception
 
@@ -58,16 +58,16 @@ def build_player(
     mask = action_mask(config, codec, domain)
     if cell.agent in settings.PLANNING_AGENTS:
         perception = Perception(codec, cell.influence, np.random.default_rng([own_seed, 1]))
-        return Built(
-            Player(_planner(cell, run, domain, config, own_seed, codec), perception, mask), None, _practised(cell, run)
-        )
+        planner = _planner(cell, run, domain, config, own_seed, codec)
+        return Built(Player(planner, perception, mask), None, _practised(cell, run, config.search_of_cells))
     if cell.policy:
         return _stored(cell, Path(cell.policy), codec, mask, own_seed)
     from planners.dqn import Training, train
 
     # Learning starts from the same weights and explores alike under every influence mode: only b~ differs.
     learning_seed = int(np.random.SeedSequence([seed, cell.seed]).generate_state(1)[0])
-    learner = Training(domain, codec, cell.inputs, cell.influence, cell.variant, config.dqn, learning_seed, mask)
+    dqn = config.dqn_of_cells
+    learner = Training(domain, codec, cell.inputs, cell.influence, cell.variant, dqn, learning_seed, mask)
     policy, training = train(learner, progress, checkpoint)
     path = run.policies / f"{cell.name}.safetensors"
     policy.save(path)
@@ -160,14 +160,15 @@ def _planner(cell: Cell, run: RunFolder, domain: Domain, config: CompareConfig, 
     return PlanningAgent(cell.agent, model, config.search_of_cells, domain.spec.geometry, seed)
 
 
-def _practised(cell: Cell, run: RunFolder) -> int:
+def _practised(cell: Cell, run: RunFolder, config: SearchConfig) -> int:
     """Environment steps of the practice that the planner's model was learned from."""
     import pyarrow.parquet as pq
 
     from planners.compare import ialm_folder
 
     shards = (ialm_folder(run, cell.variant) / "practice").glob("part-*.parquet")
-    return sum(pq.read_metadata(path).num_rows for path in shards)
+    rows = sum(pq.read_metadata(path).num_rows for path in shards)
+    return min(rows, config.practice_steps or rows)
 
 
 def _reference(cell: Cell, domain: Domain, seed: int) -> Agent:

@@ -28,6 +28,7 @@ from planners.config import CompareConfig, SearchConfig
 from planners.evaluation import Columns, evaluate, outcome_names
 
 if TYPE_CHECKING:
+    from nesy.experience import Experience
     from planners.ialm import IALM
 
 MINDS_VERSION = 1
@@ -119,7 +120,7 @@ def compare(
     domain = load_domain(domain_name)
     for variant in config.variants:
         if any(cell.agent in settings.PLANNING_AGENTS for cell in cells):
-            ensure_ialm(run, domain, variant, config.search, seed, progress)
+            ensure_ialm(run, domain, variant, config.search_of_cells, seed, progress)
     missing = [cell for cell in cells if _result(run, config, cell, seed) is None]
     total = sum(_episodes(config, cell) for cell in missing)
     with progress.task("compare", total) as task:
@@ -160,18 +161,27 @@ def _report_influence_rules(run: RunFolder, config: CompareConfig, domain: Domai
 def ensure_ialm(
     run: RunFolder, domain: Domain, variant: str, config: SearchConfig, seed: int, progress: Progress = SILENT
 ) -> None:
-    """Learn the planner's model, from the run's experience and practice of its own, unless the run holds it."""
-    provenance = {
+    """Learn the planner's model, from the run's experience and practice of its own, unless the run holds it.
+
+    Raises:
+        UserError: the practice has fewer steps than are to be learned from.
+    """
+    collected = {
         "variant": variant,
         "seed": seed,
         "practice_episodes": config.practice_episodes,
         "practice_mixture": config.practice_mixture,
+    }
+    provenance = {
+        **collected,
+        "practice_steps": config.practice_steps,
         "discount": config.discount,
         "minds": MINDS_VERSION,
     }
     home = ialm_folder(run, variant)
     path = home / "model.json"
-    if path.is_file() and read_json(path).get("provenance") == provenance:
+    before = read_json(path).get("provenance", {}) if path.is_file() else collected
+    if path.is_file() and before == provenance:
         return
     from nesy.collection import collect_following
     from nesy.dbn import TwoSliceDBN
@@ -184,12 +194,12 @@ def ensure_ialm(
     here = [experience] if _variant_of(run) in (None, variant) else []
     if config.practice_episodes:
         folder = home / "practice"
-        if path.is_file():
-            shutil.rmtree(folder, ignore_errors=True)  # of other settings
+        if any(before.get(name) != value for name, value in collected.items()):
+            shutil.rmtree(folder, ignore_errors=True)
         collect_following(
             domain, config.practice_episodes, config.practice_mixture, folder, seed, progress, variant=variant
         )
-        practice = Experience.load(folder)
+        practice = _first_steps(Experience.load(folder), config)
         here = [joined(here[0], practice) if here else practice]
         experience = joined(experience, practice)
     codec = SymbolicCodec(load_world_model(run.world_model))
@@ -199,6 +209,18 @@ def ensure_ialm(
         learn_minds(codec, here[0], provenance).save(home)
     model = learn_ialm(TwoSliceDBN.load(run.dbn), codec, experience, provenance, config.discount)
     model.save(home)
+
+
+def _first_steps(practice: Experience, config: SearchConfig) -> Experience:
+    """As many steps as are to be learned from, episode after episode."""
+    if not config.practice_steps:
+        return practice
+    if len(practice) < config.practice_steps:
+        raise UserError(
+            f"the practice has {len(practice):,} steps, fewer than the {config.practice_steps:,} to learn from; "
+            "raise --search.practice-episodes, or lower --learning-steps"
+        )
+    return practice.select(np.lexsort((practice.t, practice.episode))[: config.practice_steps])
 
 
 def _variant_of(run: RunFolder) -> str | None:
@@ -291,7 +313,7 @@ def _fingerprint(config: CompareConfig, cell: Cell, seed: int) -> str:
         "episodes": _episodes_evaluated(config, cell),
     }
     if cell.agent in settings.LEARNING_AGENTS:
-        relevant["dqn"] = asdict(replace(config.dqn, checkpoint_seconds=0.0))
+        relevant["dqn"] = asdict(replace(config.dqn_of_cells, checkpoint_seconds=0.0))
     if cell.agent in settings.PLANNING_AGENTS:
         relevant["search"] = asdict(config.search_of_cells)
     try:

@@ -28,6 +28,8 @@ class DQNConfig:
 
     episodes: int = 6000
     """Training episodes (the batch finishes the ones it has begun)."""
+    steps: int = 0
+    """Environment steps to train for, instead of a number of episodes; 0 for the number."""
     num_envs: int = 64
     """Environments stepped at once."""
     hidden: tuple[int, ...] = (256, 256)
@@ -90,7 +92,7 @@ class DQNConfig:
         """Check every number."""
         sizes = ("episodes", "num_envs", "batch_size", "memory", "hidden", "n_step")
         positive = ("learning_rate", "updates_per_step", "epsilon_decay", "gradient_clip", "reward_scale")
-        others = ("final_learning_rate", "warm_up", "target_period", "checkpoint_seconds")
+        others = ("steps", "final_learning_rate", "warm_up", "target_period", "checkpoint_seconds")
         shares = ("discount", "epsilon_start", "epsilon_end", "tau")
         check_ranges(
             self,
@@ -163,6 +165,8 @@ class SearchConfig:
     """Particles of the belief over (x, y, c, counters)."""
     practice_episodes: int = 12_000
     """Person-following episodes, besides the run's experience, that the planner's tables are learned from."""
+    practice_steps: int = 0
+    """Steps of these episodes that are learned from; 0 for all."""
     practice_mixture: float = 0.3
     """Probability that the switching behaviour of these episodes acts at random."""
     mind_discount: float = 0.99
@@ -181,7 +185,7 @@ class SearchConfig:
             self,
             "search",
             **dict.fromkeys(sizes, "[1, inf)"),
-            **dict.fromkeys(("time_limit", "exploration", "mind_exploration"), "[0, inf)"),
+            **dict.fromkeys(("time_limit", "exploration", "mind_exploration", "practice_steps"), "[0, inf)"),
             **dict.fromkeys(("discount", "mind_discount"), "[0, 1)"),
             practice_mixture="[0, 1]",
         )
@@ -215,6 +219,9 @@ class CompareConfig:
     planner_milliseconds: float = 0.0
     """Time that the agents that search get per decision, from what they see to what they do, instead of a number of
     simulations; 0 for the number. Agents compare at equal time then, but results no longer repeat exactly."""
+    learning_steps: int = 0
+    """Environment steps that every agent learns from, a DQN from its training and a planner from its practice, instead
+    of numbers of episodes; 0 for the numbers. Agents compare at equal experience then."""
     rules: tuple[str, ...] = ()
     """Rule files (docs/asp.md) that no agent may break, neither while it learns nor when it acts. Rules about the
     person act on what the planners expect of it."""
@@ -249,13 +256,20 @@ class CompareConfig:
             planner_episodes="[1, inf)",
             confidence="(0, 1)",
             planner_milliseconds="[0, inf)",
+            learning_steps="[0, inf)",
         )
 
     @property
+    def dqn_of_cells(self) -> DQNConfig:
+        """How the DQN learns here: from as many steps as all agents, if that is asked for."""
+        return replace(self.dqn, steps=self.learning_steps) if self.learning_steps else self.dqn
+
+    @property
     def search_of_cells(self) -> SearchConfig:
-        """How the planners search here: by time if that is asked for."""
+        """How the planners practise and search here: as many steps as all agents, and by time, if that is asked for."""
+        search = replace(self.search, practice_steps=self.learning_steps) if self.learning_steps else self.search
         if self.planner_milliseconds <= 0:
-            return self.search
+            return search
         seconds = self.planner_milliseconds / 1000.0
         enough = max(1000, int(seconds * MOST_SIMULATIONS))
-        return replace(self.search, time_limit=seconds, simulations=enough)
+        return replace(search, time_limit=seconds, simulations=enough)

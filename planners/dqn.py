@@ -170,19 +170,21 @@ def train(
         while not training.over:
             training.step(training.choose())
             training.learn()
-            new = min(len(training.finished), config.episodes) - told
+            new = round(training.share * config.episodes) - told
             if new > 0:
                 told += new
-                task.advance(new, mean_return=float(np.mean([row[0] for row in training.finished[-200:]])))
+                recent = [row[0] for row in training.finished[-200:]]
+                task.advance(new, mean_return=float(np.mean(recent)) if recent else 0.0)
             if checkpoint is not None and time.monotonic() - saved > config.checkpoint_seconds:
                 training.save(checkpoint)
                 saved = time.monotonic()
     if checkpoint is not None:
         training.save(checkpoint)
     training.env.close()
-    columns = zip(*training.finished[: config.episodes], strict=True)
+    finished = training.finished if config.steps else training.finished[: config.episodes]
+    kinds = {"return": np.float64, "length": np.int64, "outcome": np.int64, "step": np.int64}
     return training.policy(), {
-        name: np.array(column) for name, column in zip(("return", "length", "outcome", "step"), columns, strict=True)
+        name: np.array([row[at] for row in finished], kind) for at, (name, kind) in enumerate(kinds.items())
     }
 
 
@@ -243,9 +245,16 @@ class Training:
         self.steps, self.updates, self.owed = 0, 0, 0.0
 
     @property
+    def share(self) -> float:
+        """How much of the training is done, 0 to 1: of its steps where their number is set, else of its episodes."""
+        if self.config.steps:
+            return min(self.steps / self.config.steps, 1.0)
+        return min(len(self.finished) / self.config.episodes, 1.0)
+
+    @property
     def over(self) -> bool:
-        """Whether all episodes have ended."""
-        return len(self.finished) >= self.config.episodes
+        """Whether all of it is done."""
+        return self.share >= 1.0
 
     def policy(self) -> DQNPolicy:
         """The policy as it is now."""
@@ -263,9 +272,8 @@ class Training:
     def choose(self) -> np.ndarray:
         """Epsilon-greedy actions int64 [B], allowed ones."""
         config = self.config
-        share = len(self.finished) / config.episodes
         spread = config.epsilon_start - config.epsilon_end
-        epsilon = config.epsilon_end + spread * np.exp(-share / config.epsilon_decay)
+        epsilon = config.epsilon_end + spread * np.exp(-self.share / config.epsilon_decay)
         with torch.no_grad():
             values = self.network(torch.from_numpy(self.state)).numpy()
         explore = self.rng.random(config.num_envs) < epsilon
@@ -306,8 +314,7 @@ class Training:
         config = self.config
         if self.steps < config.warm_up:
             return
-        share = min(len(self.finished) / config.episodes, 1.0)
-        rate = config.learning_rate + (config.final_learning_rate - config.learning_rate) * share
+        rate = config.learning_rate + (config.final_learning_rate - config.learning_rate) * self.share
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         self.owed += config.updates_per_step * config.num_envs

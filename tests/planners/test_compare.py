@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from nesy.run_folder import RunFolder, read_json
 from planners.baselines import LastSeenFollower, OracleFollower
 from planners.choices import find_cell
 from planners.compare import EVALUATION_SEED, compare, grid
-from planners.config import CompareConfig
+from planners.config import CompareConfig, DQNConfig, SearchConfig
 from planners.evaluation import Player, evaluate
 from planners.results import _interval
 
@@ -166,6 +167,26 @@ def test_figures_of_several_variants_say_how_much_is_in_them(tmp_path: Path) -> 
     assert pairs[0]["maps"] == 42
     assert pairs[0]["mean"] == pytest.approx(1 - pairs[1]["mean"])
     assert pairs[0]["mean"] > 0.9  # on the same map; regardless of maps a fifth of them would weigh it down
+
+
+def test_agents_can_be_given_the_same_experience(tiny_run: Path, tmp_path: Path) -> None:
+    run = RunFolder(tmp_path / "run")
+    run.path.mkdir()
+    for name in ("world_model", "dbn", "experience", "config.json"):
+        (run.path / name).symlink_to((tiny_run / name).resolve())
+    practising = SearchConfig(simulations=4, particles=20, practice_episodes=100)
+    learning = DQNConfig(hidden=(8,), warm_up=64, batch_size=8)
+    config = CompareConfig(
+        agents=("dqn", "search"), influences=("zero",), episodes=42, planner_episodes=1, learning_steps=256
+    )
+    config = replace(config, dqn=learning, search=practising)
+    records = compare(run, config)
+    assert [record["experience_steps"] for record in records] == [256, 256]
+    practice = sorted((run.ialm / "practice").iterdir())
+    collected = [path.stat().st_mtime_ns for path in practice]
+    with pytest.raises(UserError, match=r"steps, fewer than the 1,000,000 to learn from; raise --search\.practice"):
+        compare(run, replace(config, agents=("search",), learning_steps=1_000_000))
+    assert [path.stat().st_mtime_ns for path in practice] == collected  # of the same episodes, more or fewer steps
 
 
 def test_an_oracle_out_of_reach_is_left_out_with_its_reason(tmp_path: Path) -> None:

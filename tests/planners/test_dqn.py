@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -149,6 +150,33 @@ def test_a_checkpoint_of_another_training_or_a_damaged_one_is_not_used(tmp_path:
     assert _same(_trained(), _trained(checkpoint=path))
     path.write_bytes(path.read_bytes()[:200])
     assert _same(_trained(), _trained(checkpoint=path))
+
+
+def test_training_ends_after_the_steps_it_was_given() -> None:
+    config = DQNConfig(steps=640, episodes=1, num_envs=32, hidden=(8,), warm_up=320, batch_size=8)
+    codec: Any = SumCodec()
+    training = Training(load_domain(), codec, "full", "random", "paper", config, 0)
+    told: list[int] = []
+    policy, columns = train(training, SimpleNamespace(task=lambda *_: _Counting(told)))  # type: ignore[arg-type]
+    assert training.steps == policy.trained["steps"] == 640
+    assert len(columns["return"]) == len(training.finished) > 1  # not only the one episode
+    assert columns["step"].max() <= 640
+    assert sum(told) == 1  # progress counts what the settings call episodes
+    assert training.updates == int(0.05 * 32 * 11)
+
+
+class _Counting:
+    def __init__(self, told: list[int]) -> None:
+        self.told = told
+
+    def __enter__(self) -> _Counting:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def advance(self, count: int, **_: float) -> None:
+        self.told.append(count)
 
 
 def test_rules_hold_while_exploring_and_acting() -> None:
