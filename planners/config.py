@@ -146,6 +146,11 @@ class DQNConfig:
         return cls(episodes=episodes)
 
 
+LearnerName = Literal["fast", "paper", "published"]
+LEARNERS = {"fast": DQNConfig.fast, "paper": DQNConfig.paper, "published": DQNConfig.published}
+"""Settings of the DQN by name, for a number of episodes."""
+
+
 @dataclass(frozen=True)
 class SearchConfig:
     """How the planners search."""

@@ -27,7 +27,7 @@ from nesy.progress import ConsoleProgress
 from nesy.report.comparison_figures import learning, optima, save
 from nesy.run_folder import RunFolder, read_json, write_json
 from planners.compare import compare
-from planners.config import CompareConfig, DQNConfig
+from planners.config import LEARNERS, CompareConfig, DQNConfig, LearnerName
 from planners.statistics import over_seeds
 
 MODES = ("random", "perspective-shift", "perfect-information")
@@ -35,7 +35,6 @@ PUBLISHED = (
     "Published code, last 1,000 of 10,000 episodes: perspective-shift 24.2 and 10.7 (two seeds), "
     "perfect-information 10.1, random 2.2 (one seed each)."
 )
-PRESETS = {"fast": DQNConfig.fast, "paper": DQNConfig.paper, "published": DQNConfig.published}
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ class Arguments:
     """A run with a trained world model."""
     output: Path = Path("runs/figure4")
     """Where the trainings, the tables and the figure go."""
-    preset: Literal["fast", "paper", "published"] = "fast"
+    preset: LearnerName = "fast"
     """Settings of the learner to start from."""
     episodes: int = 10_000
     """Training episodes."""
@@ -68,8 +67,8 @@ class Arguments:
 
 def defaults(arguments: list[str]) -> Arguments:
     """The options where the command line says nothing: those of the preset that it names."""
-    named = next((name for name in PRESETS if f"--preset={name}" in arguments or _follows(arguments, name)), "fast")
-    return Arguments(dqn=PRESETS[named](10_000))
+    named = next((name for name in LEARNERS if f"--preset={name}" in arguments or _follows(arguments, name)), "fast")
+    return Arguments(dqn=LEARNERS[named](10_000))
 
 
 def _follows(arguments: list[str], name: str) -> bool:

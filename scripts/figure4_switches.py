@@ -11,14 +11,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import figure4
 import tyro
 
 from nesy.errors import UserError
 from nesy.run_folder import atomic_path, write_json
-from planners.config import DQNConfig
+from planners.config import LEARNERS, DQNConfig, LearnerName
 
 SWITCHES: dict[str, dict[str, Any]] = {
     "corrected": {},
@@ -48,7 +48,7 @@ class Arguments:
     """Where everything goes; a folder for each switch."""
     switches: tuple[str, ...] = tuple(SWITCHES)
     """Which switches, each on its own; `all` together."""
-    preset: Literal["fast", "paper"] = "fast"
+    preset: LearnerName = "fast"
     """Settings of the learner to start from."""
     modes: tuple[str, ...] = figure4.MODES
     """Influence modes."""
@@ -68,7 +68,7 @@ def main(options: Arguments) -> None:
     for name in options.switches:
         if name not in SWITCHES:
             raise UserError(f"unknown switch '{name}' (known: {', '.join(SWITCHES)})")
-        dqn: DQNConfig = figure4.PRESETS[options.preset](options.episodes)
+        dqn: DQNConfig = LEARNERS[options.preset](options.episodes)
         found[name] = figure4.make(
             figure4.Arguments(
                 run=options.run,

@@ -9,8 +9,9 @@ mixture of that follower and random actions. Plug-in estimates from joint counts
 situation (beliefs count as the same if they agree to three digits); for samples of b~ the posterior of every
 configuration, by Bayes' rule from the samples' densities, averaged over the steps.
 
-Then how much of it is easily read: the bits of the configuration that a network like the DQN's leaves open after as
-few updates as a training has, on steps of other environments (Xu et al., "A theory of usable information under
+Then how much of it is easily read: the bits of the configuration (whether the person is in view, and where), of
+whether it is in view at all, and of the follower's next action that a network like the DQN's leaves open after as few
+updates as a training has, on steps of other environments (Xu et al., "A theory of usable information under
 computational constraints", ICLR 2020). What is in b~ for an ideal observer may still be hard to read.
 
 With --episodes also what is learned from each, mean return of the last tenth of the training episodes with 95 %
@@ -33,7 +34,7 @@ import tyro
 from torch import nn
 
 from domains.core import load_domain
-from nesy.perspective import PerspectiveShift
+from nesy.perspective import InfluenceBelief, PerspectiveShift
 from nesy.run_folder import RunFolder, read_json, write_json
 from nesy.world_model import SymbolicCodec, load_world_model
 from planners.config import DQNConfig
@@ -65,7 +66,7 @@ class Arguments:
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the trainings."""
     ways: tuple[str, ...] = ()
-    """Which ways are learned; all by default."""
+    """Which ways are measured and learned; all by default."""
     told: tuple[str, ...] = ("random", "perspective-shift", "perfect-information")
     """Ways that are learned with the configuration told besides."""
     jobs: int = 1
@@ -74,13 +75,29 @@ class Arguments:
     """Where the returns are kept; trainings that it holds are not repeated."""
 
 
+class Marked(Perception):
+    """The true code also while the person is out of view, but believed by half there, so that it shows at a glance."""
+
+    def __init__(self, codec: Codec, rng: np.random.Generator) -> None:
+        super().__init__(codec, "perfect-information", rng)
+        self._shift = InfluenceBelief("perfect-information", codec, rng, even_unseen=True)
+
+    def __call__(self, observation: dict[str, np.ndarray], person_views: np.ndarray) -> Percepts:
+        """Percepts of observations `view` [B, V, V] and `configuration` [B]."""
+        percepts = super().__call__(observation, person_views)
+        blurred = (percepts.shifted + np.float32(1.0 / percepts.shifted.shape[-1])) / 2
+        seen = (percepts.configurations > 0)[:, None, None]
+        return percepts._replace(shifted=np.where(seen, percepts.shifted, blurred))
+
+
 class Altered(Perception):
     """Φ with something taken out of b~ while the person is in view."""
 
     def __init__(self, alteration: str, codec: Codec, influence: str, rng: np.random.Generator) -> None:
         super().__init__(codec, influence, rng)
         self.alteration = alteration
-        self.phi = PerspectiveShift(codec, "network" if alteration == "factored" else "table")
+        network = alteration == "factored" or codec.packed() is None
+        self.phi = PerspectiveShift(codec, "network" if network else "table")
 
     def __call__(self, observation: dict[str, np.ndarray], person_views: np.ndarray) -> Percepts:
         """Percepts of observations `view` [B, V, V] and `configuration` [B]."""
@@ -128,6 +145,7 @@ WAYS: dict[str, tuple[str, Make]] = {
         _mode("perfect-information", published_occlusion=True),
     ),
     "perfect-information, also out of view": ("perfect-information", _mode("perfect-information", fallback="mode")),
+    "perfect-information, also out of view, marked": ("perfect-information", Marked),
 }
 SAMPLED = ("random", "perspective-shift, sampled")
 """Ways whose b~ is no function of the situation."""
@@ -137,22 +155,29 @@ def main(options: Arguments) -> None:
     """Measure, learn what is missing, and print the table."""
     bits = information(options)
     returns = learned(options) if options.episodes else {}
-    columns = ["configuration", "in view", "next action in view", "configuration, to a network", "distinct b~"]
+    columns = ["configuration", "in view", "next action in view"]
+    columns += [f"{what}, to a network" for what in ("configuration", "in view or not", "next action")] + [
+        "distinct b~"
+    ]
     if returns:
         columns += [f"return, {options.episodes} episodes", "return, configuration told"]
     print(f"| b~ | {' | '.join(columns)} |\n|{' --- |' * (len(columns) + 1)}")
-    for way, (whole, seen, action, read, distinct) in bits.items():
-        cells = [*(f"{figure:.2f}" for figure in (whole, seen, action, read)), f"{distinct:.0f}" if distinct else ""]
+    for way, (*figures, distinct) in bits.items():
+        cells = [*(f"{figure:.2f}" for figure in figures), f"{distinct:.0f}" if distinct else ""]
         cells += [returns.get((way, inputs), "") for inputs in ("paper", "full")] if returns else []
         print(f"| {way} | {' | '.join(cells)} |")
 
 
 def information(options: Arguments) -> dict[str, tuple[float, ...]]:
-    """For each way: bits left open of the three, and by a network; the number of different b~ (0: not counted)."""
+    """For each way: bits left open of the three, and by a network of the configuration, whether there is one, and the
+    follower's next action; the number of different b~ (0: not counted).
+    """  # noqa: D205
     domain = load_domain()
     codec: Any = SymbolicCodec(load_world_model(RunFolder(options.run).world_model))
     rng = np.random.default_rng(options.seed)
-    ways = {way: make(codec, np.random.default_rng([options.seed, 1])) for way, (_, make) in WAYS.items()}
+    needed = ("perspective-shift",) if SAMPLED[1] in options.ways else ()
+    chosen = {way: WAYS[way] for way in dict.fromkeys([*(options.ways or WAYS), *needed])}
+    ways = {way: make(codec, np.random.default_rng([options.seed, 1])) for way, (_, make) in chosen.items()}
     env: Any = domain.make("following", 256, seed=options.seed)
     observation, _ = env.reset(seed=options.seed)
     rows: dict[str, list[np.ndarray]] = {name: [] for name in ("configuration", "action", "code", "b~", *ways)}
@@ -168,11 +193,11 @@ def information(options: Arguments) -> dict[str, tuple[float, ...]]:
         rows["code"].append(percepts.codes.astype(np.int16))
         action = np.where(rng.random(256) < options.mixture, rng.integers(4, size=256), expert)
         observation, *_ = env.step(action)
-    data = {name: np.concatenate(parts) for name, parts in rows.items()}
+    data = {name: np.concatenate(parts) for name, parts in rows.items() if parts}
     code, configuration, seen = data["code"], data["configuration"], data["configuration"] > 0
     found: dict[str, tuple[float, ...]] = {}
     own = np.eye(codec.num_values, dtype=np.float32)[code].reshape(len(code), -1)
-    for way in WAYS:
+    for way in chosen:
         known = [code, seen[:, None].astype(np.int16) if way in SAMPLED else data[way]]
         exact = (
             conditional_entropy(configuration, known),
@@ -182,19 +207,20 @@ def information(options: Arguments) -> dict[str, tuple[float, ...]]:
         if way == "perspective-shift, sampled":
             exact = _sampled(data, rng)
         inputs = np.concatenate([own, data[way].astype(np.float32) / 1000], axis=1)
-        read = read_by_network(inputs, configuration, options)
-        found[way] = (*exact, read, 0 if way in SAMPLED else len({row.tobytes() for row in data[way]}))
+        wanted = (configuration, (configuration > 0).astype(np.int64), data["action"])
+        read = (read_by_network(inputs, each, options) for each in wanted)
+        found[way] = (*exact, *read, 0 if way in SAMPLED else len({row.tobytes() for row in data[way]}))
     print(f"{len(seen)} steps, {seen.sum()} of them with the person in view")
     return found
 
 
-def read_by_network(inputs: np.ndarray, configuration: np.ndarray, options: Arguments) -> float:
-    """Bits of the configuration that a network leaves open, which learned from three quarters of the environments."""
+def read_by_network(inputs: np.ndarray, target: np.ndarray, options: Arguments) -> float:
+    """Bits of `target` that a network leaves open, which learned from three quarters of the environments."""
     generator = torch.Generator().manual_seed(options.seed)
     torch.manual_seed(options.seed)
     test = torch.from_numpy(np.arange(len(inputs)) % 256 >= 192)
-    given, wanted = torch.from_numpy(inputs), torch.from_numpy(configuration)
-    network = ValueNetwork(inputs.shape[1], int(configuration.max()) + 1, replace(PLAIN, dueling=False))
+    given, wanted = torch.from_numpy(inputs), torch.from_numpy(target)
+    network = ValueNetwork(inputs.shape[1], int(target.max()) + 1, replace(PLAIN, dueling=False))
     optimiser = torch.optim.Adam(network.parameters(), lr=PLAIN.learning_rate)
     practice = torch.nonzero(~test).squeeze(1)
     for _ in range(options.updates):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import tyro
 
 from nesy.cli import pipeline, tables
 from nesy.run_folder import RunFolder, read_json
-from planners.config import CompareConfig
+from planners.config import LEARNERS, CompareConfig, LearnerName
 
 
 @dataclass(frozen=True)
@@ -20,12 +20,20 @@ class Arguments(pipeline.CommonArguments):
     """Where the grid runs: processes of this machine (--jobs), or a Ray cluster."""
     address: str | None = None
     """Address of the Ray cluster; by default the one that Ray finds, or one on this machine alone."""
+    learner: LearnerName | None = None
+    """Settings of the DQN to start from: fast (learns best per second), paper (those of the paper: one environment, an
+    update per step, twenty minutes a training), published (and all in which the published code differs from the text);
+    by default those of the run."""
     settings: Annotated[CompareConfig, tyro.conf.arg(name="")] = CompareConfig()
 
 
 def defaults(arguments: list[str]) -> Arguments:
     """The options' values where the command line says nothing."""
-    return Arguments(settings=pipeline.base_config(arguments).compare)
+    settings = pipeline.base_config(arguments).compare
+    learner = pipeline.option(arguments, "--learner")
+    if learner in LEARNERS:
+        settings = replace(settings, dqn=LEARNERS[learner](settings.dqn.episodes))
+    return Arguments(settings=settings)
 
 
 def run(options: Arguments) -> dict[str, Any]:

@@ -72,14 +72,14 @@ def base_config(arguments: list[str]) -> RunConfig:
     compared. It has to be known before the other options are parsed, so that their help shows the values that would
     really be used.
     """
-    run, preset = Path(_option(arguments, "--run") or CommonArguments.run), _option(arguments, "--preset")
+    run, preset = Path(option(arguments, "--run") or CommonArguments.run), option(arguments, "--preset")
     if preset in PRESETS:
         config = PRESETS[preset]
     elif (run / "config.json").is_file():
         config = configuration.load(run / "config.json")
     else:
         config = PRESETS["quick"]
-    variant = _option(arguments, "--variant") or config.variant
+    variant = option(arguments, "--variant") or config.variant
     if variant == config.variant:
         return config
     return replace(config, variant=variant, compare=replace(config.compare, variants=(variant,)))
@@ -94,7 +94,8 @@ def config_of(options: CommonArguments) -> RunConfig:
     return base_config(arguments)
 
 
-def _option(arguments: list[str], name: str) -> str | None:
+def option(arguments: list[str], name: str) -> str | None:
+    """What the command line gives for an option; None where it does not."""
     for position, argument in enumerate(arguments):
         if argument == name and position + 1 < len(arguments):
             return arguments[position + 1]
