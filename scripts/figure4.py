@@ -2,6 +2,9 @@
 
     python scripts/figure4.py --run runs/demo --output runs/figure4 --jobs 2
 
+Which order comes out depends on the world model: with the paper's own (a run made with --train.architecture paper
+--train.epochs 20) that of the paper, with one that loses nothing another (docs/notes/comparison.md).
+
 Leaves figure4.png, figure4.svg and figure4.json in the output folder, beside all that a comparison leaves. Called
 again after a stop it goes on where it was. By default with the corrected learner (preset `fast`) and with the same
 b~ in every mode, uniform, while the person is out of view; what the published code does otherwise is switched on
@@ -97,6 +100,7 @@ def make(options: Arguments) -> dict[str, Any]:
         "episodes": options.episodes,
         "seeds": len(options.seeds),
         "final_episodes": options.final,
+        "world_model": world_model(output),
         "modes": final_returns(output, options),
         "evaluation": {record["influence"] or "optimum": record["return"] for record in records},
     }
@@ -105,9 +109,18 @@ def make(options: Arguments) -> dict[str, Any]:
     curves = read_json(output.results / "statistics.json")["curves"]
     for curve in curves:
         curve["name"] = next(mode for mode in options.modes if f"/ {mode} /" in curve["name"])
-    notes = (f"Bands: 95 % over {len(options.seeds)} seeds. {result['ranking']}", PUBLISHED)
+    bands = f"Bands: 95 % over {len(options.seeds)} seeds. World model: {result['world_model']}."
+    notes = (f"{bands} {result['ranking']}", PUBLISHED)
     save(learning(curves, optima(records), notes), options.output / "figure4")
     return result
+
+
+def world_model(output: RunFolder) -> str:
+    """Which world model the beliefs come from, and how well it rebuilds views."""
+    stored = read_json(output.world_model / "config.json")
+    exact = stored.get("metrics", {}).get("views_exact")
+    quality = "" if exact is None else f", {100 * exact:.0f} % of the views exact"
+    return f"{stored['model']['architecture']}{quality}"
 
 
 def final_returns(output: RunFolder, options: Arguments) -> dict[str, Any]:

@@ -110,8 +110,8 @@ def improvement(statistics: dict[str, Any]) -> Figure:
         names += [pair["ours"]] if pair["ours"] not in names else []
     sizes = [0.36 * len(names) for names in variants.values()]
     letters = 0.06 * max(len(pair["ours"]) for pair in pairs)  # inches that the longest name takes
-    width = max(0.45 * max(map(len, variants.values())), 2.0) + letters + 2.5
-    figure = Figure(figsize=(width, sum(sizes) + (letters + 0.8) * len(sizes)), layout="constrained")
+    width = max(0.45 * max(map(len, variants.values())), 3.0) + letters + 2.0
+    figure = Figure(figsize=(width, sum(sizes) + 0.9 * len(sizes)), layout="constrained")
     panels = figure.subplots(len(variants), 1, squeeze=False, height_ratios=sizes)[:, 0]
     for axes, (variant, names) in zip(panels, variants.items(), strict=True):
         table = np.full((len(names), len(names)), np.nan)
@@ -131,8 +131,8 @@ def improvement(statistics: dict[str, Any]) -> Figure:
         axes.imshow(np.ma.masked_invalid(table), cmap="RdBu", vmin=0, vmax=1)
         short = [name.removesuffix(f" / {variant}") for name in names]
         counts = [_counted(counted["seeds"][name], counted["episodes"][name]) for name in names]
-        axes.set_xticks(range(len(names)), short, rotation=90, fontsize=7)
-        labels = [f"{name}  ({count})" for name, count in zip(short, counts, strict=True)]
+        axes.set_xticks(range(len(names)), [str(at + 1) for at in range(len(names))], fontsize=7)
+        labels = [f"{name}  ({count})  {at + 1}" for at, (name, count) in enumerate(zip(short, counts, strict=True))]
         axes.set_yticks(range(len(names)), labels, fontsize=7)
         axes.set_title(
             f"{variant}: P(an episode of the row beats one of the column on the same map);\n"

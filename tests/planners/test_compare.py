@@ -158,7 +158,7 @@ def test_trainings_are_resampled_and_planners_seeds_are_not() -> None:
 def test_figures_of_several_variants_say_how_much_is_in_them(tmp_path: Path) -> None:
     compare(RunFolder(tmp_path), CompareConfig(agents=("greedy-follower", "random"), variants=("paper", "clean")))
     drawn = (tmp_path / "results" / "plots" / "improvement.svg").read_text()
-    assert drawn.count("greedy-follower  (1 seed, 168 episodes)") == 2  # comments of matplotlib's SVG hold the text
+    assert drawn.count("greedy-follower  (1 seed, 168 episodes)  1") == 2  # comments of matplotlib's SVG hold the text
     pairs = read_json(tmp_path / "results" / "statistics.json")["improvement"]
     assert [(pair["ours"], pair["theirs"]) for pair in pairs[:2]] == [
         ("greedy-follower / paper", "random / paper"),
