@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 
+from nesy.errors import UserError
 from planners.bound_search import BeliefTree
 from planners.tree import Tree
 
@@ -47,7 +48,7 @@ def drawing_of(
         format: `dot` or `svg`.
 
     Raises:
-        ValueError: another format.
+        UserError: another format.
     """
     nodes = _beliefs(tree, actions, observations, depth) if isinstance(tree, BeliefTree) else None
     if nodes is None:
@@ -57,7 +58,7 @@ def drawing_of(
         return _dot(nodes)
     if format == "svg":
         return _svg(nodes)
-    raise ValueError(f"a drawing is 'dot' or 'svg', not '{format}'")
+    raise UserError(f"a drawing is 'dot' or 'svg', not '{format}'")
 
 
 def _name(names: Sequence[str] | None, i: int) -> str:

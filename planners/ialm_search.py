@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from nesy.errors import UserError
 from planners.config import SearchConfig
 from planners.drawing import drawing_of
 from planners.ialm import IALM
@@ -54,7 +55,7 @@ class IALMSearch:
         """
         mask = self.allowed if allowed is None else np.asarray(allowed, np.bool_)
         if not mask.any():
-            raise ValueError("a search needs at least one allowed action")
+            raise UserError("a search needs at least one allowed action")
         clear(self.tree)
         config = self.config
         info = walks(

@@ -16,9 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nesy.errors import UserError
 from planners import bound_kernels as kernels
 from planners.bound_kernels import BoundSet
-from planners.pomdp import TabularPOMDP
+from planners.pomdp import TabularPOMDP, check_solvable
 
 _FEW = 2000  # points x actions x observations
 _DEEPEST = 400
@@ -47,11 +48,11 @@ class Certificate:
 
     def action(self, belief: np.ndarray) -> int:
         """The action of the vector that is best at `belief`."""
-        return self.bounds.policy(sparse_belief(belief))
+        return self.bounds.policy(sparse_belief(self.bounds.model.check_belief(belief)))
 
     def at(self, belief: np.ndarray) -> tuple[float, float]:
         """Lower and upper bound at `belief`, float64 [S]."""
-        sparse = sparse_belief(belief)
+        sparse = sparse_belief(self.bounds.model.check_belief(belief))
         return self.bounds.lower(sparse), self.bounds.upper(sparse)
 
 
@@ -65,10 +66,11 @@ def solve(model: TabularPOMDP, gap: float = 1e-3, time_limit: float = 60.0, max_
         max_trials: searches after which to stop.
 
     Raises:
-        ValueError: a discount of 1, for which the bounds need not converge.
+        UserError: a discount of 1, for which the bounds need not converge; limits that cannot be met.
     """
-    if not model.discount < 1:
-        raise ValueError("the solver needs a discount below 1")
+    check_solvable(model, "the solver")
+    if not (gap >= 0 and time_limit >= 0 and max_trials >= 0):
+        raise UserError("the gap, the time limit and the number of trials must not be negative")
     bounds = PointBounds(model)
     start = sparse_belief(model.start)
     bounds.improve(start)  # compiles the kernels, which is not to count

@@ -89,6 +89,19 @@ class TabularPOMDP:
 
         write(self, Path(path))
 
+    def check_belief(self, belief: np.ndarray) -> np.ndarray:
+        """The belief as float64 [S].
+
+        Raises:
+            UserError: another shape, or no distribution.
+        """
+        checked = np.asarray(belief, np.float64)
+        if checked.shape != self.start.shape:
+            raise UserError(f"a belief has the shape {list(self.start.shape)}, found {list(checked.shape)}")
+        if not ((checked >= 0).all() and abs(checked.sum() - 1) <= 1e-5):
+            raise UserError("a belief is a probability distribution (numbers >= 0 that sum to 1)")
+        return checked
+
     def predict(self, belief: np.ndarray, action: int) -> np.ndarray:
         """Belief after the action, before the observation: [S] -> [S]."""
         predicted: np.ndarray = belief @ self.transition[action]
@@ -103,12 +116,12 @@ class TabularPOMDP:
         """Bayes: the belief after action and observation.
 
         Raises:
-            ValueError: the observation is impossible.
+            UserError: the observation is impossible.
         """
         joint = self.predict(belief, action) * self.observation[action][:, observation]
         total = joint.sum()
         if total <= 0:
-            raise ValueError(
+            raise UserError(
                 f"'{self.observations[observation]}' is impossible after '{self.actions[action]}' in this belief"
             )
         updated: np.ndarray = joint / total
@@ -134,3 +147,16 @@ class TabularPOMDP:
                 break
             value = after
         return q
+
+
+def check_solvable(model: TabularPOMDP, who: str) -> None:
+    """Whether a model can be searched or solved.
+
+    Raises:
+        UserError: it is no `TabularPOMDP`, or its discount is 1.
+    """
+    if not isinstance(model, TabularPOMDP):
+        kind = type(model).__name__
+        raise UserError(f"{who} needs a TabularPOMDP, not a {kind}; built-in problems are TabularPOMDP(**tiger())")
+    if not model.discount < 1:
+        raise UserError(f"{who} needs a discount below 1")

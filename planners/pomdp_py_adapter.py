@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import pomdp_py
 
+from nesy.errors import UserError
 from planners import kernels
 from planners.config import SearchConfig
 from planners.ialm import IALM, SCALARS
@@ -244,7 +245,7 @@ class POUCTAgent:
             The action, and what the search saw: values and visits per action, simulations.
         """
         if allowed is not None and not np.any(allowed):
-            raise ValueError("a search needs at least one allowed action")
+            raise UserError("a search needs at least one allowed action")
         agent = RobotAgent(self.model, self.compiled, belief, self.rng, allowed)
         planner = LeafValuePOUCT(self.model, self.config, spent)
         action = planner.plan(agent)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from nesy.compiled import njit
+from nesy.errors import UserError
 from planners.config import SearchConfig
 from planners.ialm import IALM
 from planners.kernels import Model
@@ -34,7 +35,7 @@ class TabularQMDP:
         """The action, and the value of each; belief float64 [S], allowed bool [A]."""
         values = self.q @ belief
         if allowed is not None and not np.any(allowed):
-            raise ValueError("a search needs at least one allowed action")
+            raise UserError("a search needs at least one allowed action")
         masked = values if allowed is None else np.where(allowed, values, -np.inf)
         return int(masked.argmax()), {"values": values.tolist(), "upper": float(values.max())}
 
@@ -53,7 +54,7 @@ class LocalQMDP:
         """The action, and the value of each; belief int16 [P, 2N + 5], allowed bool [A]; it searches for no time."""
         mask = np.ones(self.num_actions, np.bool_) if allowed is None else np.asarray(allowed, np.bool_)
         if not mask.any():
-            raise ValueError("a search needs at least one allowed action")
+            raise UserError("a search needs at least one allowed action")
         values = _one_step(self.local, belief, self.num_actions, self.discount, self._bits)
         info = {"values": values.tolist(), "visits": [len(belief)] * self.num_actions, "simulations": belief.shape[0]}
         return best_tried(info, mask), info

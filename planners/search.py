@@ -17,21 +17,23 @@ from __future__ import annotations
 
 import time
 import warnings
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
+from nesy.errors import UserError
 from planners import bound_search
 from planners.bound_search import BeliefTree
 from planners.drawing import drawing_of
 from planners.point_based import blind_policies, solve, sparse_belief
-from planners.pomdp import TabularPOMDP
+from planners.pomdp import TabularPOMDP, check_solvable
 from planners.random_bits import stream
 from planners.tree import allocate, clear, reroot
 from planners.walk import PackedPOMDP, TabularBelief, best_tried, walks
 
 _TOLERANCE = 1e-6
 _START_GAP = 0.01
+_LEAF_WEIGHTS = {"lower": 0.0, "middle": 0.5, "upper": 1.0}
 Method = Literal["bounds", "po-uct"]
 
 
@@ -79,7 +81,7 @@ class TreeSearch:
         reuse: whether the tree below what happened is kept by `update`.
 
     Raises:
-        ValueError: a discount of 1.
+        UserError: a discount of 1; a number or name that cannot be.
     """
 
     def __init__(
@@ -95,8 +97,12 @@ class TreeSearch:
         trials: int = 20,
         reuse: bool = True,
     ) -> None:
-        if not model.discount < 1:
-            raise ValueError("the search needs a discount below 1")
+        check_solvable(model, "the search")
+        if simulations < 1 or depth < 1 or not time_limit >= 0 or trials < 0:
+            raise UserError("a search needs simulations and depth of at least 1, and no negative limits")
+        if method not in get_args(Method) or leaf not in _LEAF_WEIGHTS:
+            known = f"{' or '.join(get_args(Method))}, leaves {', '.join(_LEAF_WEIGHTS)}"
+            raise UserError(f"no search with method '{method}' and leaf '{leaf}'; methods are {known}")
         self.model, self.method, self.reuse = model, method, reuse
         self.simulations, self.depth, self.time_limit = simulations, depth, time_limit
         self._planted: np.ndarray | None = None  # the belief that the tree at hand was grown for
@@ -111,7 +117,7 @@ class TreeSearch:
             warnings.warn(
                 f"lower bound above upper bound in state '{model.states[worst]}'", RuntimeWarning, stacklevel=2
             )
-        weight = {"lower": 0.0, "middle": 0.5, "upper": 1.0}[leaf]
+        weight = _LEAF_WEIGHTS[leaf]
         self._packed, self._blind = pack(model, (1 - weight) * lower + weight * upper), blind_policies(model)
         self.exploration = float(np.ptp(model.reward)) if exploration is None else exploration
         num_actions = len(model.actions)
@@ -135,10 +141,14 @@ class TreeSearch:
         Returns:
             The action, and what the search saw: values and visits per action, simulations, nodes, mean and greatest
             depth, `lower` and `upper` bound of the belief's value, and for `bounds` those of each action.
+
+        Raises:
+            UserError: no belief of this model, or no action left.
         """
+        belief = self.model.check_belief(belief)
         mask = np.ones(len(self.model.actions), np.bool_) if allowed is None else np.asarray(allowed, np.bool_)
-        if not mask.any():
-            raise ValueError("a search needs at least one allowed action")
+        if mask.shape != (len(self.model.actions),) or not mask.any():
+            raise UserError("a search needs at least one allowed action")
         if self.method == "bounds":
             return self._plan_with_bounds(belief, mask)
         return self._plan_by_walks(belief, mask)

@@ -22,6 +22,8 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
+from domains.core import DomainError
+
 LAYOUTS: dict[tuple[int, int], tuple[tuple[int, int], ...]] = {
     (4, 4): ((3, 1), (2, 1), (1, 3), (1, 0)),
     (5, 5): ((2, 4), (0, 4), (3, 3), (2, 2), (4, 1)),
@@ -54,12 +56,12 @@ def rocksample(
         discount: per step.
 
     Raises:
-        ValueError: an instance without known layout, and none given.
+        DomainError: an instance without known layout, and none given.
     """
     rocks = LAYOUTS.get((size, num_rocks)) if rocks is None else rocks
     if rocks is None or len(rocks) != num_rocks:
         known = ", ".join(f"({n}, {k})" for n, k in LAYOUTS)
-        raise ValueError(f"RockSample({size}, {num_rocks}): give {num_rocks} rocks; layouts are known for {known}")
+        raise DomainError(f"RockSample({size}, {num_rocks}): give {num_rocks} rocks; layouts are known for {known}")
     start = STARTS.get((size, num_rocks), (0, size // 2)) if start is None else start
     half_distance = HALF_DISTANCES.get((size, num_rocks), 20.0) if half_distance is None else half_distance
     worths = 1 << num_rocks

@@ -291,3 +291,20 @@ def test_warns_when_a_lower_bound_exceeds_an_upper_one() -> None:
     search._bounds.arrays.blind[:] = 1e6
     with pytest.warns(RuntimeWarning, match="lower bound above upper bound"):
         search.plan(model.start)
+
+
+def test_arguments_that_cannot_be_are_named() -> None:
+    """A belief of another length went into the kernels and corrupted memory."""
+    model = TabularPOMDP(**tiger())
+    rng = np.random.default_rng(0)
+    search, certificate = TreeSearch(model, rng, simulations=5), solve(model, max_trials=1)
+    for belief, message in ((np.full(5, 0.2), r"shape \[2\], found \[5\]"), (np.ones(2), "sum to 1"),
+                            (np.array([1.5, -0.5]), "distribution"), (np.full(2, np.nan), "distribution")):  # fmt: skip
+        for use in (search.plan, certificate.at, certificate.action):
+            with pytest.raises(UserError, match=message):
+                use(belief)
+    for options in ({"simulations": 0}, {"depth": 0}, {"method": "best"}, {"leaf": "none"}, {"time_limit": -1.0}):
+        with pytest.raises(UserError, match="search"):
+            TreeSearch(model, rng, **options)
+    with pytest.raises(UserError, match=r"TabularPOMDP\(\*\*tiger\(\)\)"):
+        TreeSearch(tiger(), rng)  # type: ignore[arg-type]
