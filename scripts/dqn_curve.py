@@ -165,9 +165,8 @@ def draw(curves: dict[str, Any], path: Path) -> None:
         colour = PALETTE[position % len(PALETTE)]
         at = [row["episodes"] for row in curve["per_seed"][0]]
         values = np.array([[row["return"] for row in rows] for rows in curve["per_seed"]])
-        axes.plot(
-            at, values.mean(axis=0), color=colour, label=f"{label} ({len(values)} seed{'s' if len(values) > 1 else ''})"
-        )
+        counted = f"{len(values)} seed{'s' if len(values) > 1 else ''}, {curve['played']} episodes at each point"
+        axes.plot(at, values.mean(axis=0), color=colour, label=f"{label} ({counted})")
         axes.fill_between(at, values.min(axis=0), values.max(axis=0), color=colour, alpha=0.2, linewidth=0)
     for optimum in {curve["optimum"] for curve in curves.values()} - {None}:
         axes.axhline(optimum, color="#000000", linestyle=":", linewidth=1)
