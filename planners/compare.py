@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from nesy.experience import Experience
     from planners.ialm import IALM
 
-MINDS_VERSION = 1
+MINDS_VERSION = 2
 """Of what is learned where minds matter (planners.minds)."""
 OUT_OF_REACH = b"out of reach"
 """Key of a cell's metadata: why an exact oracle cannot be had on its variant."""
@@ -316,6 +316,7 @@ def _fingerprint(config: CompareConfig, cell: Cell, seed: int) -> str:
         relevant["dqn"] = asdict(replace(config.dqn_of_cells, checkpoint_seconds=0.0))
     if cell.agent in settings.PLANNING_AGENTS:
         relevant["search"] = asdict(config.search_of_cells)
+        relevant["minds"] = MINDS_VERSION
     try:
         files = [*config.rules, *([cell.policy] if cell.policy else [])]
         relevant["files"] = [hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in files]
