@@ -23,14 +23,19 @@ def stream(rng: np.random.Generator) -> np.ndarray:
 
 
 @njit(cache=True)
-def uniform(state: np.ndarray) -> float:
-    """The next number of the stream `state` (uint64 [1], advanced in place), uniform in [0, 1)."""
-    state[0] += _GAMMA
-    z = state[0]
+def random_bits(state: np.ndarray) -> int:
+    """The next 64 bits of the stream `state` (uint64 [1], advanced in place), as uint64."""
+    z = state[0] + _GAMMA
+    state[0] = z
     z = (z ^ (z >> _S30)) * _MIX_1
     z = (z ^ (z >> _S27)) * _MIX_2
-    z = z ^ (z >> _S31)
-    return np.float64(z >> _S11) * (1.0 / 9007199254740992.0)
+    return z ^ (z >> _S31)
+
+
+@njit(cache=True)
+def uniform(state: np.ndarray) -> float:
+    """The next number of the stream, uniform in [0, 1)."""
+    return np.float64(random_bits(state) >> _S11) * (1.0 / 9007199254740992.0)
 
 
 @njit(cache=True)

@@ -56,12 +56,19 @@ class FactoredModel(NamedTuple):
     Attributes:
         codes: the 2DBN, for drawing.
         reward: float64 [N, K], what each value of each factor earns in the state reached.
+        paid: int64 [R], the factors that earn anything.
         seen: int64 [M], the factors that the robot observes.
     """
 
     codes: CodeSampler
     reward: np.ndarray
+    paid: np.ndarray
     seen: np.ndarray
+
+    @classmethod
+    def of(cls, codes: CodeSampler, reward: np.ndarray, seen: np.ndarray) -> FactoredModel:
+        """The model of a sampler with these rewards and these observed factors."""
+        return cls(codes, reward, np.flatnonzero(reward.any(axis=1)), seen)
 
 
 class LocalModel(NamedTuple):
@@ -114,7 +121,7 @@ def _tabular_advance(
 
 
 def _factored_room(model: FactoredModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    n = model.codes.order.shape[0]
+    n = model.codes.plan.shape[1]
     return np.zeros(n, np.int16), np.zeros(n, np.int16), np.zeros(1, np.int16)
 
 
@@ -130,8 +137,8 @@ def _factored_advance(
 ) -> tuple[float, bool, int, float]:
     next_code(model.codes, state, 0, action, after, 0, bits)
     reward, key = 0.0, 0
-    for i in range(after.shape[0]):
-        reward += model.reward[i, after[i]]
+    for j in range(model.paid.shape[0]):
+        reward += model.reward[model.paid[j], after[model.paid[j]]]
     for j in range(model.seen.shape[0]):
         key = key * model.reward.shape[1] + after[model.seen[j]]
     return reward, False, key, 0.0

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 
 from nesy.dbn.kernels import packed
-from planners.code_sampling import alias_cells, next_code, sampler
+from planners.code_sampling import alias_cells, next_code, packed_cells, sampler
 from planners.random_bits import stream
 from tests.planners.models import small_dbn
 
@@ -21,6 +21,13 @@ def test_alias_cells_hold_the_distribution() -> None:
         again[:, k] += threshold[:, k] / 7
         np.add.at(again, (np.arange(200), other[:, k]), (1 - threshold[:, k]) / 7)
     assert np.allclose(again, rows, atol=1e-12)
+    packed_again, cells = np.zeros_like(rows), packed_cells(cells, 3).astype(np.int64)
+    threshold = (cells >> 3) / 2**29
+    for k in range(7):
+        packed_again[:, k] += threshold[:, k] / 7
+        np.add.at(packed_again, (np.arange(200), cells[:, k] & 7), (1 - threshold[:, k]) / 7)
+    assert np.allclose(packed_again, rows, atol=2e-9)
+    assert (packed_again[rows == 0] == 0).all()  # what is impossible is never drawn
 
 
 def test_drawn_codes_have_the_models_distribution() -> None:

@@ -43,7 +43,7 @@ def _factored(settings: Settings) -> list[Row]:
     ]
     reward = np.zeros((_FACTORS, _VALUES))
     reward[0] = rng.normal(size=_VALUES)
-    model = FactoredModel(sampler(packed(TwoSliceDBN.from_tables(tables, parents))), reward, np.array([1]))
+    model = FactoredModel.of(sampler(packed(TwoSliceDBN.from_tables(tables, parents))), reward, np.array([1]))
     belief = rng.integers(0, _VALUES, (500, _FACTORS)).astype(np.int16)
     tree, bits = allocate(_BUDGET + 2, _ACTIONS), stream(rng)
     depths: dict[str, float] = {}
