@@ -100,16 +100,16 @@ class BeliefAgent:
         actions = np.zeros(count, np.int64)
         self.infos = [{} for _ in range(count)]
         poses = self.geometry.relative(percepts.configurations)
-        told = self._told(situation)
+        seen, told = self._seen(situation), self._told(situation)
         shared = (time.perf_counter() - begun) / max(int(situation.active.sum()), 1)
         for i in np.flatnonzero(situation.active).tolist():
             pose = poses[i] if percepts.configurations[i] > 0 else None
             belief = self.beliefs[i]
             begun = time.perf_counter()
             if situation.last_actions is None:
-                belief.reset(percepts.codes[i], pose, told[i])
+                belief.reset(seen[i], pose, told[i])
             else:
-                belief.update(int(situation.last_actions[i]), percepts.codes[i], pose, told[i])
+                belief.update(int(situation.last_actions[i]), seen[i], pose, told[i])
             allowed = None if situation.allowed is None else situation.allowed[i]
             spent = shared + time.perf_counter() - begun
             actions[i], info = self.planners[i].plan(belief.states, allowed, spent)
@@ -125,8 +125,13 @@ class BeliefAgent:
             self.beliefs.append(self._belief(filtering))
             self.planners.append(self._planner(planning))
 
+    def _seen(self, situation: Situation) -> np.ndarray:
+        """What the belief of each episode takes in of what its robot sees: codes [B, N] here."""
+        assert situation.percepts is not None
+        return situation.percepts.codes
+
     def _told(self, situation: Situation) -> Sequence[Any] | np.ndarray:
-        """What the belief of each episode is told besides code and pose."""
+        """What the belief of each episode is told besides."""
         raise NotImplementedError
 
     def _belief(self, rng: np.random.Generator) -> Any:

@@ -20,6 +20,7 @@ from planners.perception import Codec, Perception
 
 if TYPE_CHECKING:
     from planners.compare import Cell
+    from planners.ialm import IALM
     from planners.shielding import ActionMask
 
 
@@ -153,11 +154,21 @@ def _planner(cell: Cell, run: RunFolder, domain: Domain, config: CompareConfig, 
         minds = MindModel.load(home)
         agent = MindAgent(minds, codec, cell.influence, config.search_of_cells, domain.spec.geometry, seed)
         if model is not plain:
-            agent.ways.constrain(
-                (model.influence_of(agent.ways.codes) > 0) | (plain.influence_of(agent.ways.codes) <= 0)
-            )
+            agent.ways.constrain(_possible(model, plain)(agent.ways.codes))
         return agent
+    if cell.agent == "search" and (home / "mapped.json").is_file():
+        from planners.mapped_agent import MappedAgent
+        from planners.mapped_model import MappedModel
+
+        possible = None if model is plain else _possible(model, plain)
+        mapped = MappedModel.load(home)
+        return MappedAgent(mapped, codec, cell.influence, config.search_of_cells, domain.spec.geometry, seed, possible)
     return PlanningAgent(cell.agent, model, config.search_of_cells, domain.spec.geometry, seed)
+
+
+def _possible(model: IALM, plain: IALM) -> Callable[[np.ndarray], np.ndarray]:
+    """Which moves rules leave to persons with codes [n, N], from the model with them and without: bool [n, moves]."""
+    return lambda codes: (model.influence_of(codes) > 0) | (plain.influence_of(codes) <= 0)
 
 
 def _practised(cell: Cell, run: RunFolder, config: SearchConfig) -> int:

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 MINDS_VERSION = 2
 """Of what is learned where minds matter (planners.minds)."""
+MAPPED_VERSION = 1
+"""Of what is learned where walls hide things (planners.mapped_model)."""
 OUT_OF_REACH = b"out of reach"
 """Key of a cell's metadata: why an exact oracle cannot be had on its variant."""
 EVALUATION_SEED = 20_250_420
@@ -177,6 +179,7 @@ def ensure_ialm(
         "practice_steps": config.practice_steps,
         "discount": config.discount,
         "minds": MINDS_VERSION,
+        "mapped": MAPPED_VERSION,
     }
     home = ialm_folder(run, variant)
     path = home / "model.json"
@@ -188,6 +191,7 @@ def ensure_ialm(
     from nesy.experience import Experience
     from nesy.world_model import SymbolicCodec, load_world_model
     from planners.ialm_learning import joined, learn_ialm
+    from planners.mapped_learning import learn_mapped, walls_hide
     from planners.mind_learning import learn_minds, several_goals
 
     experience = Experience.load(run.experience)
@@ -203,10 +207,12 @@ def ensure_ialm(
         here = [joined(here[0], practice) if here else practice]
         experience = joined(experience, practice)
     codec = SymbolicCodec(load_world_model(run.world_model))
-    for name in ("minds.json", "minds.npz"):
+    for name in ("minds.json", "minds.npz", "mapped.json", "mapped.npz"):
         (home / name).unlink(missing_ok=True)
     if here and several_goals(here[0]):
         learn_minds(codec, here[0], provenance).save(home)
+    elif here and walls_hide(here[0]):
+        learn_mapped(here[0], config.mind_discount, provenance).save(home)
     model = learn_ialm(TwoSliceDBN.load(run.dbn), codec, experience, provenance, config.discount)
     model.save(home)
 
@@ -316,7 +322,7 @@ def _fingerprint(config: CompareConfig, cell: Cell, seed: int) -> str:
         relevant["dqn"] = asdict(replace(config.dqn_of_cells, checkpoint_seconds=0.0))
     if cell.agent in settings.PLANNING_AGENTS:
         relevant["search"] = asdict(config.search_of_cells)
-        relevant["minds"] = MINDS_VERSION
+        relevant["learned"] = MINDS_VERSION, MAPPED_VERSION
     try:
         files = [*config.rules, *([cell.policy] if cell.policy else [])]
         relevant["files"] = [hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in files]

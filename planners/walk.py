@@ -23,6 +23,7 @@ from planners import ialm
 from planners.code_sampling import CodeSampler, next_code
 from planners.ialm import SCALARS
 from planners.kernels import Model, step
+from planners.mapped_walk import mapped_advance, mapped_begin, mapped_room
 from planners.mind_walk import mind_advance, mind_begin, mind_room
 from planners.random_bits import drawn, uniform
 from planners.tree import NO_CHILD, Tree, backup, backup_best, best_by_ucb, find_child
@@ -184,6 +185,7 @@ _KINDS: dict[str, tuple[Callable[..., Any], Callable[..., Any], Callable[..., An
     "FactoredModel": (_factored_room, _factored_begin, _factored_advance),
     "LocalModel": (_local_room, _local_begin, _local_advance),
     "MindTree": (mind_room, mind_begin, mind_advance),
+    "MappedTree": (mapped_room, mapped_begin, mapped_advance),
 }
 
 
