@@ -20,6 +20,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from domains.core import UNSEEN
+from nesy.checked_arrays import distributions, whole_numbers
 from nesy.errors import UserError
 from nesy.imagined_beliefs import Believed, JointRoll, roll_factored
 from nesy.walks import Levels, Trees, levels, plan, poses_along
@@ -168,11 +169,14 @@ class PerspectiveShift:
         self._memory = _Walked.nowhere(0, model.num_factors, model.num_values)
 
     def __call__(self, beliefs: np.ndarray, configurations: np.ndarray) -> Shift:
-        """Shift beliefs [B, N, K] to configurations [B]."""
-        beliefs = np.asarray(beliefs, dtype=np.float32)
-        configurations = np.asarray(configurations, dtype=np.int64)
+        """Shift beliefs [B, N, K] to configurations [B].
+
+        Raises:
+            UserError: wrong shapes, no distributions, or no such configuration.
+        """
         num_factors, num_values = self.model.num_factors, self.model.num_values
-        assert beliefs.shape == (len(configurations), num_factors, num_values), beliefs.shape
+        beliefs = distributions(beliefs, "beliefs", (None, num_factors, num_values)).astype(np.float32)
+        configurations = whole_numbers(configurations, "configurations", (len(beliefs),), 1 << 16).astype(np.int64)
         codes = beliefs.argmax(-1).astype(np.uint8)
         certain = (beliefs.max(-1) == 1.0).all(-1)
         result = _Walked.nowhere(len(beliefs), num_factors, num_values)
@@ -239,6 +243,7 @@ class PerspectiveShift:
             views = self.model.views(codes[block])
             trees = plan(views)
             row, pose = rows[asked] - first, configurations[asked] - 1
+            whole_numbers(pose + 1, "configurations", (None,), trees.depth.shape[1] + 1)
             lengths = trees.depth[row, pose]
             reached = np.flatnonzero(lengths >= 0)
             if len(reached):
@@ -291,6 +296,9 @@ def shift(beliefs: np.ndarray, configurations: np.ndarray, model: ShiftModel, *,
         configurations: int [B], where the other agent is (0: unseen).
         model: codec or table model.
         planner: `table` or `network` (see `PerspectiveShift`).
+
+    Raises:
+        UserError: arrays of wrong shapes or values, or a planner that there is not.
     """
     return PerspectiveShift(model, planner)(beliefs, configurations)
 
@@ -304,7 +312,7 @@ def imagine(belief: np.ndarray, configuration: int, model: ShiftModel, *, planne
         model: codec or table model.
         planner: as in `shift`; by default `table` where the model has tables.
     """
-    assert np.shape(belief) == (model.num_factors, model.num_values), np.shape(belief)
+    distributions(belief, "beliefs", (model.num_factors, model.num_values))
     if planner is None:
         planner = "network" if model.packed() is None else "table"
     return PerspectiveShift(model, planner).imagine(belief, int(configuration))

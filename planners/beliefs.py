@@ -13,10 +13,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from nesy.checked_arrays import distributions, whole_numbers
 from nesy.compiled import njit
+from nesy.errors import UserError
 from planners import kernels
 from planners.ialm import IALM, SCALARS
 from planners.kernels import Model
+from planners.motion import NUM_HEADINGS
 from planners.random_bits import stream, uniform
 
 _PRIOR_FLOOR = 0.05  # how far a value that the prior excludes is still believed, per factor
@@ -56,7 +59,11 @@ class ParticleBelief:
             code: uint8 [N], the robot's code.
             pose: int [3], (side, ahead, heading) of the person if in view, else None.
             prior: float [N, K], b~.
+
+        Raises:
+            UserError: an array of another shape or range.
         """
+        code, prior = self._checked(code, pose, prior)
         n, count = self.model.num_factors, len(self.states)
         self.states[:, :n] = code
         self.states[:, n : 2 * n] = self._draw_codes(prior, count)
@@ -79,7 +86,12 @@ class ParticleBelief:
 
         Returns:
             Log-likelihood of the observation; -inf if the fallback was needed.
+
+        Raises:
+            UserError: an array of another shape or range, or no such action.
         """
+        code, prior = self._checked(code, pose, prior)
+        action = self.model.dbn.action_index(action)
         seen = np.full(3, -1, np.int16)
         if pose is not None:
             seen[:] = self.model.motion.shifted(np.asarray(pose)[None])[0]
@@ -104,6 +116,12 @@ class ParticleBelief:
             renewed = self.rng.random(len(self.states)) < self.renewal
             self.states[renewed, n : 2 * n] = self._draw_codes(prior, int(renewed.sum()))
         return float(np.log(total / len(weights)))
+
+    def _checked(self, code: np.ndarray, pose: np.ndarray | None, prior: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        n, k = self.model.num_factors, self.model.num_values
+        if pose is not None and (np.shape(pose) != (3,) or not 0 <= pose[2] < NUM_HEADINGS):
+            raise UserError(f"a pose is (side, ahead, heading 0..3), found {pose!r}")
+        return whole_numbers(code, "codes", (n,), k), distributions(prior, "priors over the person's code", (n, k))
 
     @property
     def window(self) -> int:

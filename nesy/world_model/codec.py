@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from domains.core import CELL_KINDS
+from nesy.checked_arrays import distributions, whole_numbers
 from nesy.world_model.distinct import view_keys
 from nesy.world_model.networks import SymbolicWorldModel, WorldModel
 from nesy.world_model.successors import PackedModel, pack
@@ -73,12 +75,12 @@ class SymbolicCodec:
 
     def certain(self, codes: np.ndarray) -> np.ndarray:
         """Beliefs float32 [B, N, K] that are certain of codes [B, N]."""
+        codes = whole_numbers(codes, "codes", (None, self.num_factors), self.num_values)
         return np.eye(self.num_values, dtype=np.float32)[codes]
 
     def views(self, codes: np.ndarray) -> np.ndarray:
         """Views uint8 [B, v, v] that codes [B, N] mean: the most probable kind of every cell."""
-        codes = np.asarray(codes, dtype=np.uint8)
-        assert codes.ndim == 2 and codes.shape[1] == self.num_factors, codes.shape
+        codes = whole_numbers(codes, "codes", (None, self.num_factors), self.num_values).astype(np.uint8)
         keys = code_keys(codes, self.num_values)
         _, known = self._views_of.find(keys)
         if not known.all():
@@ -94,9 +96,8 @@ class SymbolicCodec:
 
         Where all beliefs are certain, each distinct pair of a code and an action is asked once.
         """
-        beliefs, actions = np.asarray(beliefs, dtype=np.float32), np.asarray(actions, dtype=np.int64)
-        assert beliefs.shape[1:] == (self.num_factors, self.num_values), beliefs.shape
-        assert len(actions) == len(beliefs), (len(actions), len(beliefs))
+        beliefs = distributions(beliefs, "beliefs", (None, self.num_factors, self.num_values)).astype(np.float32)
+        actions = whole_numbers(actions, "actions", (len(beliefs),), self.num_actions).astype(np.int64)
         if len(beliefs) < 2 or not (beliefs.max(-1) == 1).all():
             return self._predict(beliefs, actions)
         keys = code_keys(beliefs.argmax(-1), self.num_values) * self.num_actions + actions
@@ -124,9 +125,8 @@ class SymbolicCodec:
         return self._packed
 
     def _checked(self, views: np.ndarray) -> np.ndarray:
-        views = np.asarray(views, dtype=np.uint8)
-        assert views.ndim == 3 and views.shape[1:] == (self.view_size, self.view_size), views.shape
-        return views
+        shape = (None, self.view_size, self.view_size)
+        return whole_numbers(views, "views", shape, len(CELL_KINDS)).astype(np.uint8)
 
     def _encode(self, views: np.ndarray) -> np.ndarray:
         device = self.model.device()

@@ -237,3 +237,27 @@ def test_influence_modes() -> None:
         InfluenceBelief("perfect-information", model, rng)(beliefs, configurations)
     with pytest.raises(UserError, match="unknown planner"):
         PerspectiveShift(model, "map")
+
+
+def test_arrays_from_outside_are_checked(codec: SymbolicCodec) -> None:
+    """An action or value too large read whatever lay behind a table."""
+    views = np.zeros((2, 5, 5), np.uint8)
+    codes = codec.codes(views)
+    beliefs = codec.certain(codes)
+    here = np.zeros(2, np.int64)
+    k = codec.num_values
+    for wrong, message in (
+        (lambda: codec.codes(views[0]), r"views have the shape \[any, 5, 5\], found \[5, 5\]"),
+        (lambda: codec.codes(views + 4), "views are whole numbers in 0..3"),
+        (lambda: codec.codes(views + 0.5), "views are whole numbers"),
+        (lambda: codec.views(codes.astype(int) + k), f"codes are whole numbers in 0..{k - 1}"),
+        (lambda: codec.certain(codes[:, 1:]), "codes have the shape"),
+        (lambda: codec.predict(beliefs, here + 9), "actions are whole numbers"),
+        (lambda: codec.predict(beliefs * 2, here), "beliefs are numbers >= 0 that sum to 1"),
+        (lambda: shift(beliefs, here[:1], codec), r"configurations have the shape \[2\], found \[1\]"),
+        (lambda: shift(beliefs, here + 101, codec), "configurations are whole numbers in 0..100"),
+        (lambda: shift(beliefs, here - 1, codec), "configurations are whole numbers"),
+        (lambda: shift(beliefs * np.nan, here, codec), "beliefs are numbers"),
+    ):
+        with pytest.raises(UserError, match=message):
+            wrong()

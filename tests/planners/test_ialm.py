@@ -154,6 +154,24 @@ def test_filter_falls_back_when_nothing_explains_the_observation() -> None:
     assert np.allclose(belief.person_marginals().sum(axis=1), 1.0)
 
 
+def test_the_filter_takes_no_arrays_that_do_not_fit() -> None:
+    """An action that there is not ended in a segmentation fault."""
+    model = small_ialm(5)
+    belief = ParticleBelief(model, kernels.compile_model(model), 5, np.random.default_rng(0))
+    code, pose, prior = np.array([0, 0]), np.array([0, 0, 3]), np.full((N, K), 1.0 / K)
+    belief.reset(code, pose, prior)
+    for arguments in (
+        (9, code, pose, prior),
+        (0, code + K, pose, prior),
+        (0, code[:1], pose, prior),
+        (0, code, np.array([0, 0, 4]), prior),
+        (0, code, pose, prior[:, :1]),
+        (0, code, pose, -prior),
+    ):
+        with pytest.raises(UserError):
+            belief.update(*arguments)
+
+
 def test_known_codes_are_preferred_by_how_well_they_fit() -> None:
     model = small_ialm(6)
     chances = model.code_chances(np.array([[1.0, 0.0], [0.0, 1.0]]))
