@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from planners.perception import Codec
 
 _CONTRADICTION = 10.0  # nats, for every cell that a view has otherwise than the map
+_LEAST_SHARE = 1e-4  # of whether an action moves the robot: tables are never that sure
 _RARE = 1e-5  # of the belief: below, a pose is given up
 
 
@@ -150,7 +151,7 @@ class MappedBelief:
         stayed = float(
             sum(w * (1 - moves(self.tables, self.ground, self.robot, action, p)) for p, w in _positive(weight))
         )
-        log = [np.log(max(share, 1e-9)) for share in (1.0 - stayed, stayed)]
+        log = [np.log(max(share, _LEAST_SHARE)) for share in (1.0 - stayed, stayed)]
         chart = self.model.chart
         for i, at in enumerate((then, self.robot)):
             log[i] -= _CONTRADICTION * contradictions(chart, self.kinds, view, chart.pose(at))
@@ -278,7 +279,7 @@ def carry(
         moved = moves(tables, ground, before, action, p)
         share = moved if then != before else 1.0 - moved
         for u in range(NUM_MOVES):
-            chance = max(share, 1e-4) * chances[p, u]
+            chance = max(share, _LEAST_SHARE) * chances[p, u]
             if chance * total < 1e-9:
                 continue
             after = ground.follows[p, u] if u != STAY else p
