@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from nesy.experience import Experience
     from planners.ialm import IALM
 
+TABLES_VERSION = 2
+"""Of what every planner learns (planners.ialm_learning)."""
 MINDS_VERSION = 2
 """Of what is learned where minds matter (planners.minds)."""
 MAPPED_VERSION = 1
@@ -179,6 +181,7 @@ def ensure_ialm(
         "practice_steps": config.practice_steps,
         "discount": config.discount,
         "minds": MINDS_VERSION,
+        "tables": TABLES_VERSION,
         "mapped": MAPPED_VERSION,
     }
     home = ialm_folder(run, variant)
@@ -322,7 +325,7 @@ def _fingerprint(config: CompareConfig, cell: Cell, seed: int) -> str:
         relevant["dqn"] = asdict(replace(config.dqn_of_cells, checkpoint_seconds=0.0))
     if cell.agent in settings.PLANNING_AGENTS:
         relevant["search"] = asdict(config.search_of_cells)
-        relevant["learned"] = MINDS_VERSION, MAPPED_VERSION
+        relevant["learned"] = TABLES_VERSION, MINDS_VERSION, MAPPED_VERSION
     try:
         files = [*config.rules, *([cell.policy] if cell.policy else [])]
         relevant["files"] = [hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in files]

@@ -96,7 +96,8 @@ TIMEOUT = 5
 """An ending by the clock; the model has no clock, so such a step counts as an ordinary one."""
 
 
-FORMAT, VERSION = "nesy-ialm", 1
+FORMAT, VERSION = "nesy-ialm", 2
+_ELSEWHERE = 0.1  # chance that a person has a code as any robot has it, not as persons were seen to
 _DAMAGE = (OSError, ValueError, LookupError, TypeError, AttributeError, NotImplementedError, EOFError,
            RuntimeError, zipfile.BadZipFile, zlib.error)  # fmt: skip
 """What reading a damaged archive may raise."""
@@ -120,6 +121,7 @@ class IALM:
         motion: how the relative pose c changes.
         tables: one `DecisionTable` per name in `TABLES`.
         known_codes: uint8 [V, N], the codes that experience holds; what is not among them is no view at all.
+        person_counts: float64 [V], how often persons had each of them.
         initial_poses: int16 [M, 3] relative poses at the start of episodes, with `initial_pose_counts` [M].
         leaf_values: float64 [2W + 1, 2W + 1, 4, L], see planners.bounds.
         initial_waiting: counts [W] of the waiting counter at the start of episodes.
@@ -131,6 +133,7 @@ class IALM:
     motion: RelativeMotion
     tables: dict[str, DecisionTable]
     known_codes: np.ndarray
+    person_counts: np.ndarray
     initial_poses: np.ndarray
     initial_pose_counts: np.ndarray
     initial_waiting: np.ndarray
@@ -203,8 +206,9 @@ class IALM:
         """P(y) over the known codes when each factor is believed as `prior` says.
 
         Factors are believed one by one, but their values come together: of the products of values that `prior`
-        allows only the known codes are views. Each factor keeps `floor` for all its values, so that a prior which
-        fits no known code still prefers the codes that it fits best.
+        allows only the known codes are views, and persons are seldom where most of these are had: codes are weighed
+        by how often persons had them. Each factor keeps `floor` for all its values, so that a prior which fits no
+        known code still prefers the codes that it fits best.
 
         Args:
             prior: float [N, K].
@@ -215,8 +219,15 @@ class IALM:
         """
         floored = (1 - floor) * np.asarray(prior, np.float64) + floor / self.num_values
         logarithms = np.log(floored)[np.arange(self.num_factors), self.known_codes].sum(axis=1)
-        chances = np.exp(logarithms - logarithms.max())
+        chances = np.exp(logarithms - logarithms.max()) * self._person_chances
         return np.asarray(chances / chances.sum())
+
+    @cached_property
+    def _person_chances(self) -> np.ndarray:
+        """P(y) before anything is known of the person; `_ELSEWHERE` of it spread over all known codes."""
+        counts = self.person_counts
+        share = counts / counts.sum() if counts.sum() > 0 else np.full(len(counts), 1.0 / len(counts))
+        return np.asarray((1 - _ELSEWHERE) * share + _ELSEWHERE / len(counts))
 
     def describe(self) -> list[dict[str, Any]]:
         """One record per table: name, rows, parents, examples."""
@@ -237,6 +248,7 @@ class IALM:
         for name, table in self.tables.items():
             arrays |= {f"{name}.{part}": getattr(table, part) for part in _TABLE_ARRAYS}
         arrays["codes"] = self.known_codes
+        arrays["codes.counts"] = self.person_counts
         arrays["initial.poses"] = self.initial_poses
         arrays["initial.pose_counts"] = self.initial_pose_counts
         arrays["initial.waiting"] = self.initial_waiting
@@ -303,6 +315,7 @@ class IALM:
                 motion=motion,
                 tables=tables,
                 known_codes=arrays["codes"],
+                person_counts=arrays["codes.counts"],
                 initial_poses=arrays["initial.poses"],
                 initial_pose_counts=arrays["initial.pose_counts"],
                 initial_waiting=arrays["initial.waiting"],

@@ -48,6 +48,7 @@ def check(model: IALM, num_variables: int) -> None:
     for name, counts, length in (
         ("initial.pose_counts", model.initial_pose_counts, len(model.initial_poses)),
         ("initial.waiting", model.initial_waiting, None),
+        ("codes.counts", model.person_counts, len(model.known_codes)),
     ):
         if counts.ndim != 1 or counts.dtype.kind not in "iuf" or (length is not None and len(counts) != length):
             raise UserError(f"'{name}' must be one count per entry")

@@ -13,6 +13,7 @@ from planners import ialm
 from planners.bounds import relational_values
 from planners.ialm import FORWARD, IALM, MAX_DISTANCE, SCALARS, STAY, TIMEOUT, WAIT, Codec
 from planners.motion import RelativeMotion, learn_motion
+from planners.split_tables import learn_by
 from planners.tables import DecisionTable, Parents, learn_distribution, learn_mean
 
 if TYPE_CHECKING:
@@ -90,9 +91,11 @@ def learn_ialm(
         "visible": learn_distribution(
             variables, parents("next", "next_x"), (following.next_configuration > 0).astype(np.int64), 2
         ),
-        "outcome": learn_distribution(
+        "outcome": learn_by(
+            3 * n + ialm.PERSON,
+            "person",
             variables,
-            parents("action", "motion", "person", "c", "next", "visible", "distance", "next_lost", "lost", "x", "y"),
+            parents("motion", "visible", "distance", "next_lost", "x", "y"),
             outcome,
             int(outcome.max()) + 1,
         ),
@@ -102,13 +105,15 @@ def learn_ialm(
             following.reward,
         ),
     }
+    known_codes, person_counts = _known_codes(codec, crossing, following)
     first = following.t == following.t.min()
     poses, counts = np.unique(following.relative_pose[first], axis=0, return_counts=True)
     return IALM(
         dbn=dbn,
         motion=motion,
         tables=tables,
-        known_codes=_known_codes(codec, crossing, following),
+        known_codes=known_codes,
+        person_counts=person_counts,
         initial_poses=poses.astype(np.int16),
         initial_pose_counts=counts.astype(np.int64),
         initial_waiting=np.bincount(following.waiting[first].clip(0)).astype(np.int64),
@@ -132,10 +137,12 @@ def _some_crossing(experience: Experience) -> Experience:
     return experience.select(rows[:: max(1, -(-len(rows) // _MOST_CROSSING))])
 
 
-def _known_codes(codec: Codec, crossing: Experience, following: Experience) -> np.ndarray:
-    """The distinct codes of robots and of persons: uint8 [V, N]."""
-    views = np.concatenate([crossing.view, following.view, following.next_view, following.person_view])
-    return np.unique(codec.codes(views), axis=0)
+def _known_codes(codec: Codec, crossing: Experience, following: Experience) -> tuple[np.ndarray, np.ndarray]:
+    """The distinct codes of robots and of persons, uint8 [V, N], and how often persons had them, float64 [V]."""
+    views = np.concatenate([following.person_view, crossing.view, following.view, following.next_view])
+    known, number = np.unique(codec.codes(views), axis=0, return_inverse=True)
+    of_persons = number.reshape(-1)[: len(following)]
+    return known, np.bincount(of_persons, minlength=len(known)).astype(np.float64)
 
 
 def _slot_names(num_factors: int) -> list[str]:

@@ -67,6 +67,7 @@ def small_ialm(seed: int = 0, ends: bool = False) -> IALM:
         motion=identity_motion(),
         tables=tables,
         known_codes=np.array([[0, 0], [0, 1], [1, 0], [1, 1]], np.uint8),
+        person_counts=np.ones(4),
         initial_poses=np.array([[0, 0, 3], [0, 1, 3]], np.int16),
         initial_pose_counts=np.array([3, 1]),
         initial_waiting=np.array([4, 0]),

@@ -141,6 +141,23 @@ def test_filter_agrees_with_bayes_by_enumeration() -> None:
         assert share == pytest.approx(wanted, abs=0.015)
 
 
+def test_renewal_brings_back_codes_that_no_particle_holds() -> None:
+    """Of a belief that holds one wrong code, a share `renewal` comes anew from the prior each step."""
+    model = small_ialm(4)
+    prior = np.array([[0.1, 0.9], [0.9, 0.1]])
+    shares = {}
+    for renewal in (0.0, 0.25, 1.0):
+        belief = ParticleBelief(model, kernels.compile_model(model), 20_000, np.random.default_rng(0), renewal)
+        belief.reset(np.array([0, 1]), np.array([0, 0, 3]), prior)
+        belief.states[:, N : 2 * N] = 0, 1
+        belief.update(2, np.array([1, 1]), np.array([0, 1, 3]), prior)
+        shares[renewal] = (belief.states[:, N : 2 * N] == [1, 0]).all(axis=1).mean()
+    wanted = model.code_chances(prior)[2]
+    assert shares[1.0] == pytest.approx(wanted, abs=0.015)
+    assert abs(shares[0.0] - wanted) > 0.05
+    assert shares[0.25] == pytest.approx(0.75 * shares[0.0] + 0.25 * wanted, abs=0.015)
+
+
 def test_filter_falls_back_when_nothing_explains_the_observation() -> None:
     model = small_ialm(5)
     belief = ParticleBelief(model, kernels.compile_model(model), 50, np.random.default_rng(0))
@@ -177,6 +194,12 @@ def test_known_codes_are_preferred_by_how_well_they_fit() -> None:
     chances = model.code_chances(np.array([[1.0, 0.0], [0.0, 1.0]]))
     assert chances.sum() == pytest.approx(1.0)
     assert model.known_codes[chances.argmax()].tolist() == [0, 1]
+    often = replace(model, person_counts=np.array([0.0, 0.0, 1.0, 8.0]))
+    nothing = np.full((N, K), 1.0 / K)
+    assert often.code_chances(nothing) == pytest.approx([0.025, 0.025, 0.125, 0.825])
+    unmet = replace(model, person_counts=np.zeros(4))
+    assert unmet.code_chances(nothing) == pytest.approx(model.code_chances(nothing))
+    assert unmet.code_chances(nothing) == pytest.approx([0.25] * 4)
 
 
 def test_saved_and_loaded(tmp_path: Path) -> None:
