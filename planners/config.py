@@ -26,7 +26,7 @@ MOST_SIMULATIONS = 1_000_000
 class DQNConfig:
     """How the belief DQN learns."""
 
-    episodes: int = 6000
+    episodes: int = 4000
     """Training episodes (the batch finishes the ones it has begun)."""
     steps: int = 0
     """Environment steps to train for, instead of a number of episodes; 0 for the number."""
@@ -141,7 +141,7 @@ class DQNConfig:
         )
 
     @classmethod
-    def fast(cls, episodes: int = 6000) -> DQNConfig:
+    def fast(cls, episodes: int = 4000) -> DQNConfig:
         """The settings that learn best per second here: many environments, few large updates."""
         return cls(episodes=episodes)
 
