@@ -97,6 +97,7 @@ TIMEOUT = 5
 
 
 FORMAT, VERSION = "nesy-ialm", 2
+_EVIDENCE = 0.5  # power of the product of what is believed of a code's factors: they come together, as one view
 _ELSEWHERE = 0.1  # chance that a person has a code as any robot has it, not as persons were seen to
 _DAMAGE = (OSError, ValueError, LookupError, TypeError, AttributeError, NotImplementedError, EOFError,
            RuntimeError, zipfile.BadZipFile, zlib.error)  # fmt: skip
@@ -207,8 +208,10 @@ class IALM:
 
         Factors are believed one by one, but their values come together: of the products of values that `prior`
         allows only the known codes are views, and persons are seldom where most of these are had: codes are weighed
-        by how often persons had them. Each factor keeps `floor` for all its values, so that a prior which fits no
-        known code still prefers the codes that it fits best.
+        by how often persons had them. What is believed of the factors is no independent evidence (a view that is
+        believed by a tenth has most of its factors believed by a tenth), so the root of its product counts. Each
+        factor keeps `floor` for all its values, so that a prior which fits no known code still prefers the codes that
+        it fits best.
 
         Args:
             prior: float [N, K].
@@ -218,7 +221,7 @@ class IALM:
             float64 [V], sums to 1.
         """
         floored = (1 - floor) * np.asarray(prior, np.float64) + floor / self.num_values
-        logarithms = np.log(floored)[np.arange(self.num_factors), self.known_codes].sum(axis=1)
+        logarithms = _EVIDENCE * np.log(floored)[np.arange(self.num_factors), self.known_codes].sum(axis=1)
         chances = np.exp(logarithms - logarithms.max()) * self._person_chances
         return np.asarray(chances / chances.sum())
 
