@@ -116,17 +116,22 @@ def _counts(path: Path, root: Path) -> bool:
     return path.is_file() and not any(part in IGNORED for part in path.relative_to(root).parts)
 
 
+def _is_time(column: str) -> bool:
+    """Whether a column measures time, or is a bound of one that does."""
+    return not TIMES.isdisjoint(column.split("."))
+
+
 def _content(path: Path) -> Any:
     """What a file says, without times: tables as columns, JSON as values, others as bytes."""
     if path.suffix == ".parquet":
         table = pq.ParquetFile(path).read()
-        times = [name for name in table.column_names if name.split(".")[-1] in TIMES]
+        times = [name for name in table.column_names if _is_time(name)]
         return table.drop_columns(times).replace_schema_metadata(None)
     if path.suffix == ".json":
         return _timeless(json.loads(path.read_text()))
     if path.suffix == ".csv":
         rows = csv.DictReader(path.read_text().splitlines())
-        return [{name: value for name, value in row.items() if name.split(".")[-1] not in TIMES} for row in rows]
+        return [{name: value for name, value in row.items() if not _is_time(name)} for row in rows]
     if path.suffix == ".safetensors":  # the metadata of a checkpoint says how long it took
         return {name: (array.dtype, array.tobytes()) for name, array in load_file(path).items()}
     if path.suffix in (".md", ".tex"):

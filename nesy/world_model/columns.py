@@ -7,6 +7,7 @@ nothing behind when the process is killed. Distinct views are few (958 on the `p
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -182,7 +183,8 @@ def _nameless(folder: Path, count: int, kind: type) -> np.ndarray:
     if not count:
         return np.empty(0, dtype=kind)
     with tempfile.TemporaryFile(dir=folder) as stream:
-        stream.truncate(count * np.dtype(kind).itemsize)
+        # really reserved: writing into a hole of a full disk would end the process
+        os.posix_fallocate(stream.fileno(), 0, count * np.dtype(kind).itemsize)
         return np.memmap(stream, dtype=kind, mode="r+", shape=(count,))
 
 

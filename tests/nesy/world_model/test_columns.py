@@ -1,6 +1,8 @@
 """Steps as numbers of distinct views: the same transitions as from experience in memory, nothing left on the disk."""
 
+import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -69,3 +71,18 @@ def test_views_of_many_cells_and_blocked_steps(toy: Experience) -> None:
 def test_no_experience_is_told(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no experience"):
         Columns.mapped(tmp_path, tmp_path / "scratch")
+
+
+def test_room_on_the_disk_is_reserved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Writing through the map into a hole of a full disk ended the process with a bus error."""
+    opened = []
+    real = np.memmap
+
+    def memmap(stream: Any, **options: Any) -> Any:
+        opened.append(os.fstat(stream.fileno()))
+        return real(stream, **options)
+
+    monkeypatch.setattr(np, "memmap", memmap)
+    array = module._nameless(tmp_path, 100_000, np.int64)
+    assert array.shape == (100_000,)
+    assert opened[0].st_blocks * 512 >= array.nbytes == opened[0].st_size
