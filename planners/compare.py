@@ -35,7 +35,7 @@ TABLES_VERSION = 2
 """Of what every planner learns (planners.ialm_learning)."""
 MINDS_VERSION = 2
 """Of what is learned where minds matter (planners.minds)."""
-MAPPED_VERSION = 1
+MAPPED_VERSION = 2
 """Of what is learned where walls hide things (planners.mapped_model)."""
 OUT_OF_REACH = b"out of reach"
 """Key of a cell's metadata: why an exact oracle cannot be had on its variant."""

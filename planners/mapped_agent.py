@@ -109,7 +109,7 @@ class MappedAgent(BeliefAgent):
     ) -> None:
         super().__init__(geometry, seed)
         self.model, self.codec, self.influence, self.config, self.possible = model, codec, influence, config, possible
-        self.tables = tables_of(model)
+        self.tables = tables_of(model, influence == "perfect-information")
 
     def _seen(self, situation: Situation) -> np.ndarray:
         return situation.observation["view"]

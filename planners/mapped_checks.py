@@ -35,7 +35,9 @@ def check_mapped(model: MappedModel, variables: dict[str, int]) -> None:
         if table.kind != ("mean" if name in ("reward", "later") else "distribution"):
             raise UserError(f"table '{name}' is of the wrong kind")
         classes = table.moments.shape[1]
-        wanted = {"person": NUM_MOVES, "moved": 2}.get(name, 2 if name.startswith("shown") else classes)
+        wanted = {"person": NUM_MOVES, "informed": NUM_MOVES, "moved": 2}.get(
+            name, 2 if name.startswith("shown") else classes
+        )
         if classes != wanted:
             raise UserError(f"table '{name}' must tell {wanted} classes apart")
     if model.next_lost.moments.shape[1] > _MOST_LOST:

@@ -29,7 +29,7 @@ from planners.mapped_ways import features, walls_in_view
 from planners.mapping import Chart, chart_of, note, patch, walks_to, ways_on
 from planners.mind_learning import whole_episodes
 from planners.motion import FORWARD, NUM_HEADINGS, NUM_MOVES, STAY
-from planners.tables import Parents, learn_distribution, learn_mean
+from planners.tables import DecisionTable, Parents, learn_distribution, learn_mean
 
 if TYPE_CHECKING:
     from nesy.experience import Experience
@@ -72,7 +72,7 @@ def learn_mapped(experience: Experience, discount: float, provenance: dict[str, 
     chart = chart._replace(usual=_usual(maps))
     width = following.view.shape[1]
     number = chart.number(persons)
-    person = _learn_person(chart, following, robots, number, t)
+    person, informed = (_learn_person(chart, following, robots, persons, t, told) for told in (False, True))
     shown = _learn_sight(chart, maps, following, robots, persons, t)
     wall = following.view[:, width // 2, width - 2] == WALL
     in_front = (following.relative_pose[:, :2] == (0, 1)).all(1)
@@ -98,6 +98,7 @@ def learn_mapped(experience: Experience, discount: float, provenance: dict[str, 
     return MappedModel(
         chart,
         person,
+        informed,
         tuple(shown),
         moves,
         learn_distribution(walk_variables(walk, lost)[goes_on], LOST, next_lost[goes_on], int(next_lost.max()) + 1),
@@ -139,9 +140,13 @@ def _from_here_on(flags: np.ndarray, t: np.ndarray) -> np.ndarray:
     return out
 
 
-def _learn_person(chart: Chart, following: Experience, robots: np.ndarray, number: np.ndarray, t: np.ndarray) -> Any:
-    """pi, on maps as they were at the time, and as they had been some steps before."""
-    columns = [_around(chart, following.view, robots, number, t, lag) for lag in _LAGS]
+def _learn_person(
+    chart: Chart, following: Experience, robots: np.ndarray, persons: np.ndarray, t: np.ndarray, told: bool
+) -> DecisionTable:
+    """The table pi, on maps as they were at the time, and as they had been some steps before; see `_around`."""
+    views = np.stack([following.view, following.person_view])
+    poses = np.stack([robots, persons])
+    columns = [_around(chart, views, poses, chart.number(persons), t, lag, told) for lag in _LAGS]
     return learn_distribution(
         np.concatenate(columns), PERSON, np.tile(following.person_action.astype(np.int64), len(_LAGS)), NUM_MOVES
     )
@@ -149,7 +154,7 @@ def _learn_person(chart: Chart, following: Experience, robots: np.ndarray, numbe
 
 def _learn_sight(
     chart: Chart, maps: np.ndarray, following: Experience, robots: np.ndarray, persons: np.ndarray, t: np.ndarray
-) -> list[Any]:
+) -> list[DecisionTable]:
     """P(shown | walls in the view) per cell of a view, as robots and persons saw on maps that are known by now."""
     views = np.concatenate([following.view, following.person_view])
     where = np.concatenate([chart.number(robots), chart.number(persons)])
@@ -174,9 +179,12 @@ def _draw(chart: Chart, views: np.ndarray, poses: np.ndarray, t: np.ndarray, map
 
 @njit(cache=True)
 def _around(
-    chart: Chart, views: np.ndarray, robots: np.ndarray, number: np.ndarray, t: np.ndarray, lag: int
+    chart: Chart, views: np.ndarray, poses: np.ndarray, number: np.ndarray, t: np.ndarray, lag: int, told: bool
 ) -> np.ndarray:
-    """The variables of `PERSON` on the robot's map of `lag` steps before (of the first step, at first): int32."""
+    """The variables of `PERSON` on the robot's map of `lag` steps before (of the first step, at first): int32.
+
+    `views` [2, n, V, V] and `poses` [2, n, 3] are the robot's and the person's; where `told`, both are on the map.
+    """
     out = np.zeros((len(t), AROUND + 3), np.int32)
     size = chart.usual.shape[0]
     kinds = np.zeros((size, size), np.uint8)
@@ -185,7 +193,9 @@ def _around(
             kinds[:] = UNSEEN
         if t[i] == 0 or t[i] > lag:
             j = i if t[i] == 0 else i - lag
-            note(chart, kinds, views[j], robots[j])
+            note(chart, kinds, views[0, j], poses[0, j])
+            if told:
+                note(chart, kinds, views[1, j], poses[1, j])
         patch(chart, kinds, number[i], REACH, BACK, FRONT, WALL, out[i])
         out[i, AROUND] = number[i] // NUM_HEADINGS // size
         out[i, AROUND + 1] = number[i] // NUM_HEADINGS % size

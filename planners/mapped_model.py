@@ -62,6 +62,7 @@ _VARIABLES = {
     name: len(parents.names)
     for name, parents in {
         "person": PERSON,
+        "informed": PERSON,
         "moved": MOVES,
         "next_lost": LOST,
         "outcome": STEP,
@@ -77,7 +78,8 @@ class MappedModel:
 
     Attributes:
         chart: where maps lie, how poses add up, what is usual.
-        person: pi, P(u | `PERSON`).
+        person: pi, P(u | `PERSON`), on maps of what the robot has seen.
+        informed: the same on maps of what both have seen, for `perfect-information`.
         shown: P(a cell of a view is shown | which cells of the view are wall), one table per cell, row by row from
             the viewer's own.
         moved: P(the action moves the robot | `MOVES`).
@@ -91,6 +93,7 @@ class MappedModel:
 
     chart: Chart
     person: DecisionTable
+    informed: DecisionTable
     shown: tuple[DecisionTable, ...]
     moved: DecisionTable
     next_lost: DecisionTable
@@ -106,10 +109,10 @@ class MappedModel:
         """Values of the lost counter."""
         return int(self.next_lost.moments.shape[1])
 
-    @cached_property
-    def policy(self) -> tuple[PackedTables, np.ndarray]:
+    def policy(self, informed: bool) -> tuple[PackedTables, np.ndarray]:
         """The table pi for kernels, and P(u) by its nodes: float64 [nodes, 4], nowhere 0."""
-        return pack([self.person]), (1 - _FLOOR) * self.person.estimates() + _FLOOR / NUM_MOVES
+        table = self.informed if informed else self.person
+        return pack([table]), (1 - _FLOOR) * table.estimates() + _FLOOR / NUM_MOVES
 
     @cached_property
     def sight(self) -> PackedTables:
@@ -195,6 +198,7 @@ class MappedModel:
             model = cls(
                 Chart(**{name: arrays[f"chart.{name}"] for name in Chart._fields}),
                 table("person"),
+                table("informed"),
                 tuple(table(f"shown{i}") for i in range(min(view_size, 99) ** 2)),
                 table("moved"),
                 table("next_lost"),
@@ -214,6 +218,7 @@ class MappedModel:
         """All tables by name."""
         return {
             "person": self.person,
+            "informed": self.informed,
             **{f"shown{i}": table for i, table in enumerate(self.shown)},
             "moved": self.moved,
             "next_lost": self.next_lost,

@@ -24,6 +24,8 @@ from planners.tables import PackedTables, locate
 _LEAST = 0.01
 _RARE = 0.02
 """Moves of the person below this share of pi are left out of what is imagined."""
+_MOST = 400
+"""Nodes from which on no further layer is made: whoever may go anywhere is not imagined far."""
 _NEAR = 6
 """Longest imagined walk to the person at which a way of the robot still counts."""
 
@@ -67,7 +69,7 @@ class Layers(NamedTuple):
         row: int64 [N], which row of `walk`.
         successor: int64 [N, 4], -1 for none: where there is none at all, the node is not followed any further.
         chance: float64 [N, 4], cumulative.
-        begin: int64 [T + 1], the first node of each layer, and N.
+        begin: int64 [T + 1], the first node of each layer, and N; T is the horizon + 1, or less.
         walk: uint8 [P, Q], least number of actions from each pose of the robot.
         value: float32 [N, Q, L].
     """
@@ -81,9 +83,9 @@ class Layers(NamedTuple):
     value: np.ndarray
 
 
-def tables_of(model: MappedModel) -> Tables:
-    """What kernels read."""
-    person, policy = model.policy
+def tables_of(model: MappedModel, informed: bool = False) -> Tables:
+    """What kernels read; `informed`: with pi on maps of what both have seen."""
+    person, policy = model.policy(informed)
     return Tables(
         model.chart,
         person,
@@ -219,6 +221,9 @@ def unroll(
     first, end = 0, people.shape[0]
     for t in range(horizon):
         begin[t] = first
+        if t > 1 and end > _MOST:
+            begin[t + 1] = end
+            return place[:end], successor[:end], chance[:end], begin[: t + 2]
         size = end
         for i in range(first, end):
             if mass[i] < _LEAST:
