@@ -88,7 +88,7 @@ def drawn(moments: list[Moment], steps: list[int]) -> str:
 
     from nesy.report.figures import svg
 
-    figure = Figure(figsize=(1.6 * len(moments), 3.6), layout="constrained")
+    figure = Figure(figsize=(1.3 * len(moments) + 0.4, 3.2), layout="constrained")
     rows = figure.subplots(2, len(moments), squeeze=False)
     for above, below, moment, step in zip(rows[0], rows[1], moments, steps, strict=True):
         middle = moment.place.shape[0] // 2
@@ -100,6 +100,10 @@ def drawn(moments: list[Moment], steps: list[int]) -> str:
         below.plot(np.arange(len(moment.true_code)), moment.true_code, "o", color="tab:red", markersize=3)
         for axes in (above, below):
             axes.set(xticks=[], yticks=[])
+        above.set_xlabel(f"{moment.place.shape[0]} x {moment.place.shape[1]} cells", fontsize=6)
+        below.set_xlabel("factor", fontsize=6)
+    rows[0, 0].set_ylabel("where the person is,\nas the robot looks", fontsize=7)
+    rows[1, 0].set_ylabel("the person's code:\nvalue of each factor", fontsize=7)
     return svg(figure)
 
 

@@ -4,7 +4,9 @@
 
 For every budget (simulations per decision), prior over the person's code (influence mode) and seed, plays the maps of
 a run's variant with the agent `search` and its learned tables. Leaves `curves.json` and `curves.svg`: mean return with
-a 95 % interval over episodes and seeds; effective particles as a share, and how often a belief had to start afresh.
+a 95 % interval; effective particles as a share, and decisions in a belief of fewer than a twentieth of them. Every map
+is played at every point, so the interval is of what a point loses against the best return seen on each map: what maps
+differ in is no chance.
 What is there already is not measured again, so a stopped run goes on.
 """
 
@@ -104,22 +106,40 @@ def drawn(rows: list[dict[str, Any]]) -> str:
     """Both curves and the particles as one SVG."""
     from matplotlib.figure import Figure
 
-    from nesy.report.figures import svg
+    from nesy.report.figures import PALETTE, svg
 
-    figure = Figure(figsize=(9, 3.2), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    for prior in sorted({row["prior"] for row in rows}):
+    figure = Figure(figsize=(9, 2.8), layout="constrained")
+    panels = figure.subplots(1, 3)
+    best: dict[int, float] = {}
+    for row in rows:
+        for name, reached in zip(row["map_ids"], row["returns"], strict=True):
+            best[name] = max(best.get(name, -np.inf), reached)
+    priors = [prior for prior in INFLUENCE_MODES[::-1] if any(row["prior"] == prior for row in rows)]
+    for number, prior in enumerate(priors):
         mine = [row for row in rows if row["prior"] == prior]
-        budgets = sorted({row["budget"] for row in mine})
-        pooled = [np.concatenate([r["returns"] for r in mine if r["budget"] == budget]) for budget in budgets]
-        error = [1.96 * np.std(values) / np.sqrt(len(values)) for values in pooled]
-        left.errorbar(budgets, [values.mean() for values in pooled], error, label=prior, capsize=2, marker="o")
-        share = [np.mean([r["effective_share"] for r in mine if r["budget"] == budget]) for budget in budgets]
-        right.plot(budgets, share, label=prior, marker="o")
-    for axes, title in ((left, "return"), (right, "effective particles, share of all")):
-        axes.set(xscale="log", xlabel="simulations per decision", title=title)
+        budgets = np.array(sorted({row["budget"] for row in mine}))
+        at = [[row for row in mine if row["budget"] == budget] for budget in budgets]
+        lost = [np.concatenate([[best[m] for m in r["map_ids"]] - np.array(r["returns"]) for r in rs]) for rs in at]
+        beside = budgets * 1.06 ** (number - (len(priors) - 1) / 2)  # intervals side by side
+        style: dict[str, Any] = {
+            "label": prior,
+            "color": PALETTE[number % len(PALETTE)],
+            "marker": "o",
+            "markersize": 4,
+        }
+        error = [1.96 * values.std() / np.sqrt(len(values)) for values in lost]
+        means = [np.mean([np.mean(row["returns"]) for row in rs]) for rs in at]
+        panels[0].errorbar(beside, means, error, capsize=2, **style)
+        for axes, name in ((panels[1], "effective_share"), (panels[2], "depleted_share")):
+            axes.plot(budgets, [np.mean([row[name] for row in rs]) for rs in at], **style)
+    titles = ("return", "effective particles,\nshare of all", "decisions with less than\n5 % effective particles")
+    for axes, title in zip(panels, titles, strict=True):
+        axes.set(xscale="log", xlabel="simulations per decision")
+        axes.set_title(title, fontsize=9)
         axes.grid(color="#999999", linewidth=0.3)
-    left.legend(fontsize=7)
+    for axes in panels[1:]:
+        axes.set_ylim(0, 1)
+    panels[2].legend(fontsize=7, loc="center right")
     return svg(figure)
 
 
