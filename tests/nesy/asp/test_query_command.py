@@ -124,7 +124,12 @@ def test_mistakes_are_one_clear_line(run, capsys, question, words):
 def test_ctrl_c_ends_a_query_and_its_process(run):
     command = [sys.executable, "-m", "nesy.cli.main", "query", "--run", str(run), "--time-limit", "60"]
     process = subprocess.Popen(
-        [*command, "--program", str(run / "endless.lp")], stderr=subprocess.PIPE, text=True, start_new_session=True
+        [*command, "--program", str(run / "endless.lp")],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        # a shell's background jobs ignore SIGINT, and so would this
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     children: list[int] = []
     deadline = time.monotonic() + 60
