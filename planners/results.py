@@ -3,10 +3,11 @@
 episodes (all seeds pooled) -> records (means, interquartile means, intervals, regret, share of the optimum)
                             -> tables (planners.result_tables), statistics.json, plots
 
-Intervals: stratified by map where maps come more than once, since every agent meets the same ones; where each comes
-once, of what the optimum there does not explain (a control variate); for agents that learn, with three seeds or more,
-over seeds, since the episodes of one training have that training in common. Shares of the optimum are of what it gets
-in the same episodes: on the same maps, or, where a map says too little (who knows which goal is meant), when it plays.
+Intervals: over whole maps where there are more than anybody could play (those played are a sample); else stratified by
+map where maps come more than once, since every agent meets the same ones; where each comes once, of what the optimum
+there does not explain (a control variate); for agents that learn, with three seeds or more, over seeds, since the
+episodes of one training have that training in common. Shares of the optimum are of what it gets in the same episodes:
+on the same maps, or, where a map says too little (who knows which goal is meant), when it plays.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from planners.improvement import Played, improvement
 from planners.statistics import (
     Interval,
     bootstrap,
+    cluster_bootstrap,
     interquartile_mean,
     means_with_intervals,
     over_seeds,
@@ -131,11 +133,23 @@ def _interval(
     config: CompareConfig,
     robust: bool = False,
     best: np.ndarray | None = None,
+    sampled: bool = False,
 ) -> Interval:
-    """Mean (or interquartile mean) of `values`; `best` is what the optimum gets in each of these episodes."""
+    """Mean (or interquartile mean) of `values`.
+
+    Args:
+        values: float [n].
+        rows: the episodes.
+        config: has the coverage.
+        robust: the interquartile mean.
+        best: what the optimum gets in each of these episodes.
+        sampled: whether the maps are a sample of many.
+    """
     if _over_seeds(rows) and not robust:
         return over_seeds(values, rows["seed"], 0, config.confidence)
     statistic = interquartile_mean if robust else np.mean
+    if sampled:
+        return cluster_bootstrap(values, rows["map_id"], 0, config.confidence, statistic)
     if np.unique(rows["map_id"], return_counts=True)[1].min() >= 2:
         return stratified_bootstrap(values, rows["map_id"], 0, config.confidence, statistic)
     if best is None or robust:  # nothing to resample within a map
@@ -165,9 +179,11 @@ def _record(
     peer: dict[str, np.ndarray] | None,
 ) -> dict[str, Any]:
     returns, success = rows["return"], (rows["outcome"] == "success").astype(np.float64)
+    sampled = optimum is None  # it is out of reach where there are too many maps
     best = _best(rows, optimum, peer, "return")
-    mean_return = _interval(returns, rows, config, best=best).as_dict()
-    mean_success = _interval(success, rows, config, best=_best(rows, optimum, peer, "success")).as_dict()
+    mean_return = _interval(returns, rows, config, best=best, sampled=sampled).as_dict()
+    best_success = _best(rows, optimum, peer, "success")
+    mean_success = _interval(success, rows, config, best=best_success, sampled=sampled).as_dict()
     reference = optimum and optimum["mean_return"] if best is None else float(best.mean())
     record: dict[str, Any] = dict(zip(CONDITION, (str(part) for part in condition), strict=True))
     if record["agent"] == "optimum" and optimum is not None:
@@ -179,13 +195,13 @@ def _record(
         if name not in METRICS_OF_NO_EPISODE and column.dtype.kind in "fi" and not np.isnan(column.astype(float)).all()
     }
     groups = rows["seed"] if _over_seeds(rows) else rows["map_id"]
-    measured = means_with_intervals(columns, groups, _over_seeds(rows), 0, config.confidence)
+    measured = means_with_intervals(columns, groups, sampled or _over_seeds(rows), 0, config.confidence)
     return {
         **record,
         "seeds": [int(seed) for seed in np.unique(rows["seed"])],
         "episodes": len(returns),
         "return": mean_return,
-        "interquartile_mean": _interval(returns, rows, config, robust=True).as_dict(),
+        "interquartile_mean": _interval(returns, rows, config, robust=True, sampled=sampled).as_dict(),
         "success": mean_success,
         "ms_per_decision": float(np.median(rows["ms_per_decision"])),
         "experience_steps": int(rows["experience_steps"].max()),

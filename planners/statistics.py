@@ -83,6 +83,22 @@ def stratified_bootstrap(
     return _percentiles(samples, pooled, point, seed, confidence, resamples)
 
 
+def cluster_bootstrap(
+    values: np.ndarray,
+    groups: np.ndarray,
+    seed: int,
+    confidence: float = 0.95,
+    statistic: Callable[..., np.ndarray] = np.mean,
+    resamples: int = 2000,
+) -> Interval:
+    """As `bootstrap`, but resampling whole groups, each with the mean of its values; `groups` [n] are labels."""
+    values = np.asarray(values, np.float64)
+    labels, group = np.unique(groups, return_inverse=True)
+    means = np.bincount(group, values, len(labels)) / np.bincount(group, minlength=len(labels))
+    found = bootstrap(means, seed, confidence, statistic, resamples)
+    return Interval(float(statistic(values, axis=-1)), found.low, found.high)
+
+
 def _percentiles(
     samples: list[np.ndarray],
     statistic: Callable[..., np.ndarray],

@@ -6,6 +6,7 @@ import pytest
 from planners.improvement import Played, improvement
 from planners.statistics import (
     bootstrap,
+    cluster_bootstrap,
     interquartile_mean,
     means_with_intervals,
     over_seeds,
@@ -124,3 +125,15 @@ def test_the_interval_over_seeds_is_that_of_their_means() -> None:
     between, pooled = over_seeds(values, seeds, 0), bootstrap(values, 0)
     assert between.mean == pytest.approx(pooled.mean)
     assert between.high - between.low > 3 * (pooled.high - pooled.low)
+
+
+def test_repeats_of_a_map_say_nothing_about_other_maps() -> None:
+    """A follower without chance played each of 84 maps three times: an interval of no width."""
+    rng = np.random.default_rng(0)
+    by_map = rng.normal(100.0, 20.0, 84)
+    values, maps = np.tile(by_map, 3), np.tile(np.arange(84), 3)
+    found = cluster_bootstrap(values, maps, 0)
+    once = bootstrap(by_map, 0)
+    assert (found.mean, found.low, found.high) == pytest.approx((once.mean, once.low, once.high))
+    assert found.high - found.low > 5
+    assert stratified_bootstrap(values, maps, 0).low == stratified_bootstrap(values, maps, 0).high

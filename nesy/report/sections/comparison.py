@@ -15,9 +15,9 @@ ANCHOR = "comparison"
 TITLE = "Comparison"
 INTERVALS = (
     "Evaluation on the same maps and seeds for all. Brackets: 95 % bootstrap intervals, stratified by map; where each "
-    "map comes once, of what the optimum there does not explain; of agents that learn, with three seeds or more, over "
-    "seeds (with fewer they leave out how much one training differs from another). 'learned from' counts environment "
-    "steps besides those of the world model."
+    "map comes once, of what the optimum there does not explain; where maps are too many to be played, over maps; of "
+    "agents that learn, with three seeds or more, over seeds (with fewer they leave out how much one training differs "
+    "from another). 'learned from' counts environment steps besides those of the world model."
 )
 
 
