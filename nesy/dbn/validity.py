@@ -177,13 +177,13 @@ def impossible_steps(
         return {}
     codes, next_codes = encode(views), encode(next_views)
     known = np.concatenate([codes, next_codes])
-    known = known[unique_rows(known)[0]]
-    steps = np.column_stack([codes, actions, next_codes]).astype(np.uint8)
+    known = _distinct(known)
+    steps = _distinct(np.column_stack([codes, actions, next_codes]).astype(np.uint8))
     rng = np.random.default_rng(seed)
     drawn = known[rng.integers(len(known), size=samples)]
     taken = rng.integers(dbn.num_actions, size=samples)
     later = sample_codes(packed(dbn), drawn, taken, rng.random(drawn.shape))
-    contexts = np.unique(np.column_stack([codes, actions]).astype(np.uint8), axis=0)
+    contexts = _distinct(steps[:, : dbn.num_factors + 1])
     best = np.empty((len(contexts), dbn.num_factors), dtype=np.uint8)
     for a in range(dbn.num_actions):
         here = contexts[:, -1] == a
@@ -193,6 +193,11 @@ def impossible_steps(
         "transitions": 1.0 - float(_among(np.column_stack([drawn, taken, later]), steps).mean()),
         "likeliest": 1.0 - float(_among(np.column_stack([contexts, best]), steps).mean()),
     }
+
+
+def _distinct(rows: np.ndarray) -> np.ndarray:
+    """The distinct rows, in lexicographic order; there are up to a hundred million rows."""
+    return np.asarray(rows[unique_rows(rows)[0]])
 
 
 def _among(rows: np.ndarray, known: np.ndarray) -> np.ndarray:
