@@ -38,6 +38,10 @@ OUTCOMES = ("", "success", "agent_at_goal", "lost", "unescorted", "timeout")
 Task: TypeAlias = Literal["crossing", "following"]
 
 
+MOST_MAPS = 5_000
+"""Of more maps than these nothing is worked out map by map: `occluded` has 51,520, with 76 million steps."""
+
+
 class DomainError(ValueError):
     """A mistake of the caller's: the message says what was wrong, where, and what would be right."""
 

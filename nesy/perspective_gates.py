@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from domains.core import UNSEEN, WALL, Domain, DomainError, ViewGeometry, load_domain
+from domains.core import MOST_MAPS, UNSEEN, WALL, Domain, DomainError, ViewGeometry, load_domain
 from nesy.experience import held_out as drawn_maps
 from nesy.experience import load_columns
 from nesy.perspective import PerspectiveShift, TableModel
@@ -39,9 +39,11 @@ class Situations:
 
 
 def situations(domain: Domain, variant: str = "paper") -> Situations | None:
-    """All situations of a variant of the following task; None where its maps are too many to list."""
+    """All situations of a variant of the following task; None where its maps are too many (`MOST_MAPS`)."""
     try:
         grids, _ = domain.maps(variant)
+        if len(grids) > MOST_MAPS:
+            return None
         place, before, action, _ = domain.transitions(variant, task="following")
     except DomainError:
         return None

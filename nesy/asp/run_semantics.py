@@ -35,11 +35,13 @@ def semantics_report(run: RunFolder, domain_name: str, variant: str, seed: int) 
 def _recovered(
     run: RunFolder, book: Codebook, domain_name: str, variant: str, num_values: int
 ) -> dict[str, Any] | None:
-    from domains.core import DomainError, load_domain
+    from domains.core import MOST_MAPS, DomainError, load_domain
     from nesy.world_model import SymbolicCodec, load_world_model
 
     domain = load_domain(domain_name)
     try:
+        if len(domain.maps(variant)[0]) > MOST_MAPS:
+            return None
         views = domain.views(variant, "crossing")
     except DomainError:
         return None

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from domains.core import Domain, DomainError
+from domains.core import MOST_MAPS, Domain, DomainError
 from nesy.dbn.inference import likely_next
 from nesy.dbn.kernels import packed, sample_codes
 from nesy.dbn.model import TwoSliceDBN
@@ -169,9 +169,11 @@ def impossible_steps(
     Returns:
         Shares of the steps drawn: `states` lead to a code that is the code of no view of any map, `transitions` are
         steps that no map allows; `likeliest`: of all possible codes and actions, those whose most probable next
-        code is not possible after them. Empty where the maps are too many to be listed.
+        code is not possible after them. Empty where the maps are too many to be listed, or more than `MOST_MAPS`.
     """
     try:
+        if len(domain.maps(variant)[0]) > MOST_MAPS:
+            return {}
         _, views, actions, next_views = domain.transitions(variant, "following")
     except DomainError:
         return {}
