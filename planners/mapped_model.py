@@ -28,7 +28,7 @@ from nesy.run_folder import atomic_path, read_json, write_json
 from planners.mapped_checks import check_mapped
 from planners.mapping import Chart
 from planners.motion import NUM_MOVES
-from planners.tables import DecisionTable, PackedTables, Parents, pack
+from planners.tables import DecisionTable, PackedTables, Parents, pack, stored_table
 
 REACH, BACK, FRONT = 3, 2, 5
 """How far to the sides, behind and ahead of the person pi looks on the map."""
@@ -187,12 +187,7 @@ class MappedModel:
                 arrays = {name: stored[name] for name in stored.files}
 
             def table(name: str) -> DecisionTable:
-                kept = description["tables"][name]
-                parts = {
-                    part: arrays[f"{name}.{part}"] for part in ("slot", "value", "ordered", "yes", "no", "moments")
-                }
-                names = {int(slot): str(text) for slot, text in kept["names"].items()}
-                return DecisionTable(**parts, kind=str(kept["kind"]), names=names)
+                return stored_table(name, description["tables"][name], arrays)
 
             view_size = int(description["view_size"])
             model = cls(

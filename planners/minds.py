@@ -33,7 +33,7 @@ from planners.intentions import Intentions, ways_to
 from planners.mind_checks import check_minds
 from planners.motion import NUM_MOVES
 from planners.scenes import Scenes
-from planners.tables import DecisionTable, Parents
+from planners.tables import DecisionTable, Parents, stored_table
 
 PHASES = (2, 3, 4, 5, 6)
 """The clock is asked about as t modulo these."""
@@ -173,12 +173,7 @@ class MindModel:
                 arrays = {name: stored[name] for name in stored.files}
 
             def table(name: str) -> DecisionTable:
-                kept = description["tables"][name]
-                parts = {
-                    part: arrays[f"{name}.{part}"] for part in ("slot", "value", "ordered", "yes", "no", "moments")
-                }
-                names = {int(slot): str(text) for slot, text in kept["names"].items()}
-                return DecisionTable(**parts, kind=str(kept["kind"]), names=names)
+                return stored_table(name, description["tables"][name], arrays)
 
             scenes = {name.removeprefix("scenes."): a for name, a in arrays.items() if name.startswith("scenes.")}
             model = cls(

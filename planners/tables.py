@@ -13,7 +13,7 @@ Every table is learned from (parents, target) pairs and knows nothing about what
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -377,3 +377,10 @@ def _locate_all(
             node = yes[node] if met else no[node]
         out[i] = node
     return out
+
+
+def stored_table(name: str, description: dict[str, Any], arrays: dict[str, np.ndarray]) -> DecisionTable:
+    """A table from its `kind` and `names` in a JSON file and its arrays `NAME.PART` in the .npz file beside it."""
+    parts = {part: arrays[f"{name}.{part}"] for part in ("slot", "value", "ordered", "yes", "no", "moments")}
+    names = {int(slot): str(text) for slot, text in description["names"].items()}
+    return DecisionTable(**parts, kind=str(description["kind"]), names=names)
