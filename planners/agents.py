@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 
 from domains.core import BatchedEnvironment, ViewGeometry
-from planners.beliefs import ParticleBelief
 from planners.config import SearchConfig
-from planners.ialm import IALM
-from planners.kernels import compile_model
 from planners.perception import Percepts
+from planners.person_following.beliefs import ParticleBelief
+from planners.person_following.ialm import IALM
+from planners.person_following.kernels import compile_model
 
 if TYPE_CHECKING:
-    from planners.dqn import DQNPolicy  # imports torch
+    from planners.dqn.dqn import DQNPolicy  # imports torch
 
 
 class Situation(NamedTuple):
@@ -158,13 +158,13 @@ class PlanningAgent(BeliefAgent):
 
     def _planner(self, rng: np.random.Generator) -> Planner:
         if self.kind == "pomdp":
-            from planners.pomdp_py_adapter import POUCTAgent
+            from planners.person_following.pomdp_py_adapter import POUCTAgent
 
             return POUCTAgent(self.model, self.compiled, self.config, rng)
         if self.kind == "qmdp":
-            from planners.qmdp import LocalQMDP
+            from planners.person_following.qmdp import LocalQMDP
 
             return LocalQMDP(self.model, self.compiled, self.config, rng)
-        from planners.ialm_search import IALMSearch
+        from planners.person_following.ialm_search import IALMSearch
 
         return IALMSearch(self.model, self.compiled, self.config, rng)

@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from nesy.perspective import BeliefCodec, InfluenceBelief
+from nesy.perspective.operator import BeliefCodec, InfluenceBelief
 
 
 class Codec(BeliefCodec, Protocol):

@@ -23,17 +23,17 @@ from nesy.cli import configuration
 from nesy.config import TrainConfig
 from nesy.run_folder import RunFolder
 from nesy.world_model import Transitions, reference_transitions
-from nesy.world_model.autoencoding import Ingredients
-from nesy.world_model.code_search import CodeSearch, SearchSettings
+from nesy.world_model.codes.autoencoding import Ingredients
+from nesy.world_model.codes.code_search import CodeSearch, SearchSettings
+from nesy.world_model.codes.questions import Questions
+from nesy.world_model.codes.readability import readability
+from nesy.world_model.codes.refinement import Refiner
 from nesy.world_model.columns import Columns
 from nesy.world_model.distinct import view_keys, with_mirror
-from nesy.world_model.gates import book_nll
-from nesy.world_model.held_out import HeldOut
-from nesy.world_model.questions import Questions
-from nesy.world_model.readability import readability
-from nesy.world_model.refinement import Refiner
 from nesy.world_model.structure import Limits
-from nesy.world_model.symbolic_training import MOST_PARENTS, SymbolicTrainer
+from nesy.world_model.training.gates import book_nll
+from nesy.world_model.training.held_out import HeldOut
+from nesy.world_model.training.symbolic_training import MOST_PARENTS, SymbolicTrainer
 
 CODES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "everything": ({}, {}),

@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from nesy.dbn import TwoSliceDBN
+from nesy.dbn.inference.plans import reached
 from nesy.dbn.parts import known_part
-from nesy.dbn.plans import reached
-from nesy.formats.agreement import by_pyagrum, by_storm, own
+from nesy.formats.programs.agreement import by_pyagrum, by_storm, own
 
 
 def main() -> None:

@@ -19,8 +19,8 @@ from domains.core import load_domain
 from nesy.run_folder import RunFolder, atomic_path
 from planners.agents import PlanningAgent, Situation
 from planners.config import INFLUENCE_MODES, SearchConfig
-from planners.ialm import IALM
 from planners.perception import Perception
+from planners.person_following.ialm import IALM
 
 
 class Moment(NamedTuple):

@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from domains.classic import rocksample, tiger
-from planners.point_based import solve
-from planners.pomdp import TabularPOMDP
-from planners.search import TreeSearch, closed_loop, exact_return
+from planners.explicit.point_based import solve
+from planners.explicit.pomdp import TabularPOMDP
+from planners.search.tree_search import TreeSearch, closed_loop, exact_return
 
 
 @dataclass(frozen=True)

@@ -26,13 +26,13 @@ from domains.core import load_domain
 from nesy.report.comparison_figures import save
 from nesy.run_folder import RunFolder, read_json, write_json
 from planners.agents import DQNAgent
-from planners.compare import EVALUATION_SEED
+from planners.comparison.compare import EVALUATION_SEED
+from planners.comparison.evaluation import Player, evaluate
+from planners.comparison.results import map_optimum
+from planners.comparison.statistics import over_seeds
 from planners.config import DQNConfig
-from planners.dqn import Training
-from planners.evaluation import Player, evaluate
-from planners.published import dqn_perception
-from planners.results import map_optimum
-from planners.statistics import over_seeds
+from planners.dqn.dqn import Training
+from planners.dqn.published import dqn_perception
 
 WITHIN = 0.97
 

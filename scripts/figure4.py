@@ -29,9 +29,9 @@ from nesy.errors import UserError
 from nesy.progress import ConsoleProgress
 from nesy.report.comparison_figures import learning, optima, save
 from nesy.run_folder import RunFolder, read_json, write_json
-from planners.compare import compare
+from planners.comparison.compare import compare
+from planners.comparison.statistics import over_seeds
 from planners.config import LEARNERS, CompareConfig, DQNConfig, LearnerName
-from planners.statistics import over_seeds
 
 MODES = ("random", "perspective-shift", "perfect-information")
 PUBLISHED = (

@@ -65,16 +65,16 @@ def loaders() -> tuple[Loader, ...]:
     from nesy.asp import KnowledgeBase
     from nesy.cli import configuration
     from nesy.dbn import Codebook, TwoSliceDBN
-    from nesy.experience import Experience
     from nesy.formats import read
+    from nesy.log.experience import Experience
     from nesy.report.page import section_body
     from nesy.report.sections import provenance, world_model
     from nesy.run_folder import RunFolder
     from nesy.world_model import load_world_model
-    from planners.dqn import DQNPolicy
-    from planners.ialm import IALM
-    from planners.pomdp import TabularPOMDP
-    from planners.replay import load_replays
+    from planners.comparison.replay import load_replays
+    from planners.dqn.dqn import DQNPolicy
+    from planners.explicit.pomdp import TabularPOMDP
+    from planners.person_following.ialm import IALM
 
     def summary(root: Path) -> None:
         run = RunFolder(root)

@@ -13,13 +13,13 @@ import numpy as np
 import tyro
 
 from domains.core import load_domain
-from nesy.collection import collect
 from nesy.config import CollectConfig, TrainConfig
-from nesy.experience import Experience
+from nesy.log.collection import collect
+from nesy.log.experience import Experience
 from nesy.progress import ConsoleProgress
 from nesy.world_model import SymbolicCodec, load_world_model, train
 from nesy.world_model.distinct import transitions_of, view_keys
-from nesy.world_model.gates import limits, next_gates, view_gates
+from nesy.world_model.training.gates import limits, next_gates, view_gates
 
 
 @dataclass(frozen=True)

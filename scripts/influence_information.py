@@ -34,14 +34,14 @@ import tyro
 from torch import nn
 
 from domains.core import load_domain
-from nesy.perspective import InfluenceBelief, PerspectiveShift
+from nesy.perspective.operator import InfluenceBelief, PerspectiveShift
 from nesy.run_folder import RunFolder, read_json, write_json
 from nesy.world_model import SymbolicCodec, load_world_model
+from planners.comparison.statistics import over_seeds
 from planners.config import DQNConfig
-from planners.dqn import Training, ValueNetwork, train
+from planners.dqn.dqn import Training, ValueNetwork, train
+from planners.dqn.published import TEMPERATURE, dqn_perception
 from planners.perception import Codec, Perception, Percepts
-from planners.published import TEMPERATURE, dqn_perception
-from planners.statistics import over_seeds
 
 HEADINGS = 4
 PLAIN = DQNConfig.fast()

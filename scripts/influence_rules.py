@@ -1,7 +1,7 @@
 """What a rule about the person is worth: "a person facing a wall does not walk forward", as a prior on the influence.
 
 The planners' model is learned from few and from many episodes of following, and as many of the crossing task's
-expert, without and with the rule (planners.influence_rules). Measured: how probable it calls the moves that persons
+expert, without and with the rule (influence_rules). Measured: how probable it calls the moves that persons
 really made, in bits per move, on episodes it was not learned from; how probable moves into walls were before; and the
 return of our own search. Pairs of figures are compared move by move and episode by episode (same maps, same seeds);
 intervals are bootstrapped over episodes.
@@ -22,19 +22,19 @@ import tyro
 
 from domains.core import Domain, load_domain
 from nesy.cli import configuration
-from nesy.collection import collect_following
 from nesy.dbn import TwoSliceDBN
-from nesy.experience import Experience
+from nesy.log.collection import collect_following
+from nesy.log.experience import Experience
 from nesy.run_folder import RunFolder
 from nesy.world_model import SymbolicCodec, load_world_model
 from planners.agents import PlanningAgent
+from planners.comparison.evaluation import Player, evaluate
+from planners.comparison.statistics import bootstrap
 from planners.config import SearchConfig
-from planners.evaluation import Player, evaluate
-from planners.ialm import IALM, WAIT
-from planners.ialm_learning import learn_ialm
-from planners.influence_rules import constrain_influence
 from planners.perception import Perception
-from planners.statistics import bootstrap
+from planners.person_following.ialm import IALM, WAIT
+from planners.person_following.ialm_learning import learn_ialm
+from planners.person_following.influence_rules import constrain_influence
 
 RULE = "person_forbidden(forward) :- person_now(wall_ahead)."
 

@@ -23,8 +23,8 @@ import torch
 import tyro
 
 from domains.core import load_domain
-from nesy.collection import collect
 from nesy.config import CollectConfig, TrainConfig
+from nesy.log.collection import collect
 from nesy.world_model import train
 from nesy.world_model.storage import load_tensors
 

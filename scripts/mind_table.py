@@ -23,10 +23,10 @@ from scipy.stats import t as student
 from domains.core import load_domain
 from nesy.cli.configuration import load
 from nesy.run_folder import RunFolder, atomic_path
-from planners.cells import build_player, restored_player
-from planners.compare import Cell, ensure_ialm
+from planners.comparison.compare import Cell, ensure_ialm
+from planners.comparison.evaluation import Player
+from planners.comparison.players import build_player, restored_player
 from planners.config import INFLUENCE_MODES
-from planners.evaluation import Player
 
 SHIFT = "search, perspective-shift"
 _RESAMPLES = 4000

@@ -19,18 +19,18 @@ import tyro
 
 from domains.core import load_domain
 from nesy.cli import configuration
-from nesy.experience import Experience
+from nesy.log.experience import Experience
 from nesy.run_folder import RunFolder
 from nesy.world_model import Transitions, reference_transitions
-from nesy.world_model.code_search import CodeSearch
+from nesy.world_model.codes.code_search import CodeSearch
+from nesy.world_model.codes.questions import Questions
+from nesy.world_model.codes.readability import readability
+from nesy.world_model.codes.refinement import CodeBook, Refiner
 from nesy.world_model.distinct import transitions_of, view_keys, with_mirror
-from nesy.world_model.gates import limits
-from nesy.world_model.questions import Questions
-from nesy.world_model.readability import readability
-from nesy.world_model.refinement import CodeBook, Refiner
 from nesy.world_model.structure import Limits
-from nesy.world_model.symbolic_training import MOST_PARENTS
 from nesy.world_model.tables import all_tables, log_probability
+from nesy.world_model.training.gates import limits
+from nesy.world_model.training.symbolic_training import MOST_PARENTS
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from domains.core import load_domain
 from nesy.dbn import Codebook, TwoSliceDBN
-from nesy.formats.execution import execute
+from nesy.formats.programs.execution import execute
 from nesy.world_model import SymbolicCodec, load_world_model
 
 

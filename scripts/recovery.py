@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import argparse
 
-from nesy.dbn.recovery import recover
-from nesy.dbn.structure import SCORES, Search
+from nesy.dbn.evaluation.recovery import recover
+from nesy.dbn.learning.structure import SCORES, Search
 
 
 def main() -> None:

@@ -38,7 +38,7 @@ def text() -> str:
 
 
 def _command(name: str, summary: str) -> str:
-    module = importlib.import_module(f"nesy.cli.{name}")
+    module = importlib.import_module(f"nesy.cli.commands.{name}")
     description = inspect.cleandoc(module.__doc__ or "")
     default = module.defaults([]) if hasattr(module, "defaults") else module.Arguments()
     first, _, rest = description.partition("\n\n")

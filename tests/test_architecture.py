@@ -59,7 +59,7 @@ def test_dependencies_flow_one_way(path: Path) -> None:
 def test_submodules_are_found_when_they_are_asked_for() -> None:
     code = (
         "import nesy, planners, sys; assert 'torch' not in sys.modules; "
-        "nesy.formats.export; nesy.asp.KnowledgeBase; nesy.perspective.shift; planners.pomdp.TabularPOMDP; "
+        "nesy.formats.export; nesy.asp.KnowledgeBase; nesy.perspective.shift; planners.explicit.TabularPOMDP; "
         "assert not hasattr(nesy, 'nothing')"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)

@@ -124,7 +124,7 @@ def test_command_line_parses(page: str, line: str) -> None:
     name, *arguments = shlex.split(line)
     assert name in COMMANDS
     try:
-        parse(importlib.import_module(f"nesy.cli.{name}"), f"nesy {name}", arguments)
+        parse(importlib.import_module(f"nesy.cli.commands.{name}"), f"nesy {name}", arguments)
     except SystemExit as request:  # --help
         assert not request.code
 

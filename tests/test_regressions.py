@@ -28,7 +28,7 @@ def test_a_crossing_step_tells_of_no_person() -> None:
 def test_the_last_seen_follower_keeps_the_person_in_view() -> None:
     """Where the way to the last seen pose did not end in its heading, it lost the person: 85.3 instead of 90.5."""
     from planners.baselines import LastSeenFollower
-    from planners.evaluation import Player, evaluate
+    from planners.comparison.evaluation import Player, evaluate
 
     domain = load_domain()
     result = evaluate(domain, "paper", Player(LastSeenFollower(domain, "paper")), 42, seed=5)
@@ -37,7 +37,7 @@ def test_the_last_seen_follower_keeps_the_person_in_view() -> None:
 
 def test_a_pomdp_file_without_states_is_refused(tmp_path: Path) -> None:
     """`states:` with no name after it divided by zero at `start: uniform`."""
-    from planners.pomdp import TabularPOMDP
+    from planners.explicit.pomdp import TabularPOMDP
 
     path = tmp_path / "empty.pomdp"
     path.write_text("discount: 0.9\nvalues: reward\nstates:\nactions: a\nobservations: o\nstart: uniform\n")

@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from domains.person_following.domain import DOMAIN as DOMAIN
-    from domains.person_following.oracle_table import oracle_row as oracle_row
+    from domains.person_following.oracles.oracle_table import oracle_row as oracle_row
     from domains.person_following.speed import benchmark as benchmark
 
 __all__ = ["DOMAIN", "benchmark", "oracle_row"]
 
-_PLACES = {"DOMAIN": "domain", "benchmark": "speed", "oracle_row": "oracle_table"}
+_PLACES = {"DOMAIN": "domain", "benchmark": "speed", "oracle_row": "oracles.oracle_table"}
 
 
 def __getattr__(name: str) -> Any:

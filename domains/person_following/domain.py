@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from domains.core import DomainSpec, OracleResult, RecordedSteps, ViewGeometry
-from domains.person_following.enumeration import all_maps, all_transitions, all_views
 from domains.person_following.experts import LastSeenFollower
 from domains.person_following.metrics import belief_metrics, episode_metrics
+from domains.person_following.oracles.enumeration import all_maps, all_transitions, all_views
 from domains.person_following.predicates import ViewPredicates
 from domains.person_following.variants import VARIANTS, Parameters, parameters_of
 from domains.person_following.vector_env import PersonFollowingVectorEnv
@@ -68,20 +68,20 @@ class PersonFollowing:
 
     def optimum(self, variant: str = "paper", discount: float = 0.9, **parameters: Any) -> OracleResult:
         """The exact full-state optimum over the maps of a variant, weighted as the generator draws them."""
-        from domains.person_following.oracles import full_state_optimum
+        from domains.person_following.oracles.full_state import full_state_optimum
 
         grids, weights = _maps(variant, tuple(sorted(parameters.items())))
         return full_state_optimum(grids, weights, parameters_of(variant, **parameters), discount)
 
     def bayes_optimum(self, variant: str = "paper", discount: float = 0.9, **parameters: Any) -> OracleResult:
         """The exact optimum of an agent that knows the set of worlds, and sees only its observations."""
-        from domains.person_following.history_policies import bayes_optimum
+        from domains.person_following.oracles.history_policies import bayes_optimum
 
         return bayes_optimum(*self._worlds_of(variant, parameters), discount)
 
     def egocentric_optimum(self, variant: str = "paper", discount: float = 0.9, **parameters: Any) -> OracleResult:
         """The same for an agent in whose model of the person nobody is ever mistaken, played in the true task."""
-        from domains.person_following.history_policies import egocentric_optimum
+        from domains.person_following.oracles.history_policies import egocentric_optimum
 
         return egocentric_optimum(*self._worlds_of(variant, parameters), discount)
 

@@ -10,8 +10,14 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from domains.core import OUTCOMES, DomainError, ViewGeometry
-from domains.person_following.batch import NUM_ACTIONS, Batch, checked_actions, checked_task, observation_space
-from domains.person_following.random_numbers import stream_of, write_back
+from domains.person_following.simulation.batch import (
+    NUM_ACTIONS,
+    Batch,
+    checked_actions,
+    checked_task,
+    observation_space,
+)
+from domains.person_following.simulation.random_numbers import stream_of, write_back
 from domains.person_following.variants import parameters_of
 
 if TYPE_CHECKING:

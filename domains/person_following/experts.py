@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from domains.core import EMPTY, FORWARD, LEFT, RIGHT, STAY, UNSEEN, WALL, ViewGeometry
-from domains.person_following.paths import allocate_scratch, find_path
+from domains.person_following.simulation.paths import allocate_scratch, find_path
 from domains.person_following.variants import Parameters
 
 _REACH = 10  # cells around the robot that its path search considers

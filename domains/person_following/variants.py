@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from domains.core import DomainError
-from domains.person_following.map_generation import MAX_SIZE
-from domains.person_following.paths import HEADING_ALWAYS, HEADING_NEVER, HEADING_UNLESS_0
+from domains.person_following.simulation.map_generation import MAX_SIZE
+from domains.person_following.simulation.paths import HEADING_ALWAYS, HEADING_NEVER, HEADING_UNLESS_0
 
 # Columns of the vector of rules that the kernel reads.
 (

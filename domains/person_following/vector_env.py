@@ -12,9 +12,14 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from domains.core import OUTCOMES, DomainError, ViewGeometry
-from domains.person_following.batch import NUM_ACTIONS, Batch, checked_actions, checked_task, observation_space
-from domains.person_following.variants import Parameters, parameters_of
-from domains.person_following.world import (
+from domains.person_following.simulation.batch import (
+    NUM_ACTIONS,
+    Batch,
+    checked_actions,
+    checked_task,
+    observation_space,
+)
+from domains.person_following.simulation.world import (
     BELIEVED_X,
     BELIEVED_Y,
     GOAL_X,
@@ -27,6 +32,7 @@ from domains.person_following.world import (
     X,
     Y,
 )
+from domains.person_following.variants import Parameters, parameters_of
 
 _OUTCOME_NAMES = np.array(OUTCOMES)
 

@@ -6,10 +6,10 @@ import importlib
 from typing import Any
 
 _WHERE = {
-    "Answer": "nesy.asp.solver",
+    "Answer": "nesy.asp.program.solver",
     "Finding": "nesy.asp.finding",
     "KnowledgeBase": "nesy.asp.knowledge",
-    "VOCABULARY": "nesy.asp.facts",
+    "VOCABULARY": "nesy.asp.program.facts",
 }
 
 __all__ = sorted(_WHERE)

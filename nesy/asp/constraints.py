@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nesy.asp.facts import asp_name
+from nesy.asp.program.facts import asp_name
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
 

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nesy.asp.finding import Edge, Finding, finding
-from nesy.asp.meaning_questions import MeaningQuestions
-from nesy.asp.solver import Answer, solve
-from nesy.asp.sources import Programs, listed, read_sources
-from nesy.asp.step_questions import StepQuestions
+from nesy.asp.program.solver import Answer, solve
+from nesy.asp.program.sources import Programs, listed, read_sources
+from nesy.asp.questions.meaning_questions import MeaningQuestions
+from nesy.asp.questions.step_questions import StepQuestions
 from nesy.dbn.codebook import Codebook
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
@@ -59,7 +59,7 @@ class KnowledgeBase(MeaningQuestions, StepQuestions):
         Raises:
             UserError: no particles, or no such predicate.
         """
-        from nesy.asp.belief import BeliefQuestions
+        from nesy.asp.questions.belief import BeliefQuestions
 
         started = time.perf_counter()
         found = BeliefQuestions(self._truth()).ask(particles, predicates)
@@ -85,7 +85,7 @@ class KnowledgeBase(MeaningQuestions, StepQuestions):
     ) -> Finding:
         """What does the robot know about what the person sees?
 
-        The particles are those of the perspective-shifted belief (nesy.asp.minds). "The robot knows that the person
+        The particles are those of the perspective-shifted belief (minds). "The robot knows that the person
         sees the goal" is `knows` for goal_visible: it holds in everything that the person may be seeing.
 
         Args:
@@ -98,7 +98,7 @@ class KnowledgeBase(MeaningQuestions, StepQuestions):
         Raises:
             UserError: a wrong code or predicate.
         """
-        from nesy.asp.minds import persons_worlds
+        from nesy.asp.questions.minds import persons_worlds
 
         started = time.perf_counter()
         worlds = persons_worlds(self.dbn, self.book, np.asarray(start), configuration, particles, seed)

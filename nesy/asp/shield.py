@@ -17,10 +17,10 @@ import clingo
 import numpy as np
 from clingo import ast
 
-from nesy.asp.encoding import ENCODINGS
-from nesy.asp.facts import asp_name
-from nesy.asp.solver import solve
-from nesy.asp.sources import Programs, Source, read_sources
+from nesy.asp.program.encoding import ENCODINGS
+from nesy.asp.program.facts import asp_name
+from nesy.asp.program.solver import solve
+from nesy.asp.program.sources import Programs, Source, read_sources
 from nesy.errors import UserError
 
 Fallback = Literal["all", "stay", "error"]
@@ -243,7 +243,7 @@ class Shield:
         """A distribution over actions without the forbidden ones: knowledge from people as a prior.
 
         With a shield over the person's actions (`PERSON`: "a person facing a wall does not walk forward"), this
-        constrains the influence I(u | l), see planners.influence_rules.
+        constrains the influence I(u | l), see planners.person_following.influence_rules.
 
         Args:
             probabilities: float [B, A], rows sum to 1.

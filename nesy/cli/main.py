@@ -71,7 +71,7 @@ def _run(name: str, arguments: list[str]) -> int:
     from domains.core import DomainError
     from nesy.errors import UserError
 
-    command = importlib.import_module(f"nesy.cli.{name}")
+    command = importlib.import_module(f"nesy.cli.commands.{name}")
     try:
         options = parse(command, f"nesy {name}", arguments)
     except SystemExit as request:  # --help was asked for and has been printed

@@ -230,7 +230,7 @@ class Pipeline:
     def collect(self) -> dict[str, Any]:
         """Collect experience."""
         from domains.core import load_domain
-        from nesy.collection import collect
+        from nesy.log.collection import collect
 
         if not self.run.has("collect") or "experience" not in self.run.read_summary():
             domain = load_domain(self.config.domain)
@@ -288,11 +288,11 @@ class Pipeline:
             fidelity = self._timed("fidelity", lambda: fidelity_report(*where))
             self.run.update_summary(dbn={**measured["dbn"], "fidelity": fidelity})
         if "perspective" not in measured:
-            from nesy.perspective_gates import evaluate_run
+            from nesy.perspective.gates import evaluate_run
 
             self._figures("perspective", "perspective", lambda: evaluate_run(*where, config.train.held_out))
         if "semantics" not in measured:
-            from nesy.asp.run_semantics import semantics_report
+            from nesy.asp.semantics.run import semantics_report
 
             self._figures("semantics", "semantics", lambda: semantics_report(*where))
         return dict(self.run.read_summary()["dbn"])
@@ -303,9 +303,9 @@ class Pipeline:
         self.run.update_summary(**{section: figures})
 
     def compare(self, engine: str = "local", address: str | None = None) -> dict[str, Any]:
-        """Compare the agents, with an engine of `planners.engines`."""
+        """Compare the agents, with an engine of `planners.comparison.engines`."""
         self.run.require("collect", "train", "extract")
-        from planners.compare import compare
+        from planners.comparison.compare import compare
 
         cells = self._timed(
             "compare",
@@ -327,7 +327,7 @@ class Pipeline:
 
     def _record_replays(self) -> None:
         """Play a few episodes of the comparison again for the report, unless that has been done."""
-        from planners.replay import record_replays
+        from planners.comparison.replay import record_replays
 
         record_replays(self.run, self.config.compare, self.config.seed, self.progress, self.config.domain)
 

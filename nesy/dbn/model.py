@@ -293,13 +293,13 @@ class TwoSliceDBN:
         Returns:
             float64 [N, K].
         """
-        from nesy.dbn.inference import predict
+        from nesy.dbn.inference.exact import predict
 
         return predict(self, belief, self.action_index(action))
 
     def filter(self, belief: np.ndarray, action: int | str, likelihood: np.ndarray) -> np.ndarray:
-        """Exact posterior marginals after an action and an observation (see nesy.dbn.inference.update)."""
-        from nesy.dbn.inference import update
+        """Exact posterior marginals after an action and an observation (see nesy.dbn.inference.exact.update)."""
+        from nesy.dbn.inference.exact import update
 
         return update(self, belief, self.action_index(action), likelihood)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from nesy.asp.facts import SCALE, VOCABULARY, Facts
+from nesy.asp.program.facts import SCALE, VOCABULARY, Facts
 from nesy.dbn.model import TwoSliceDBN
 from nesy.run_folder import atomic_path
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nesy.dbn.inference import likely_next
+from nesy.dbn.inference.exact import likely_next
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
 from nesy.formats.bayes_nodes import identifier

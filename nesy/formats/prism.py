@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
+from nesy.dbn.inference.plans import Reached, reached
 from nesy.dbn.model import TwoSliceDBN
-from nesy.dbn.plans import Reached, reached
 from nesy.dbn.step_tables import StepTable
 from nesy.formats.bayes_nodes import identifier
 from nesy.run_folder import atomic_path

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from domains.core import load_domain
-from nesy.experience import Experience
-from nesy.perspective import imagine
+from nesy.log.experience import Experience
+from nesy.perspective.operator import imagine
 from nesy.report.figures import BeliefExample
 from nesy.run_folder import RunFolder, read_json
 from nesy.world_model import SymbolicCodec, load_world_model

@@ -13,7 +13,7 @@ import numpy as np
 
 from domains.core import load_domain
 from nesy.errors import UserError
-from nesy.perspective import ImaginedPath, PerspectiveShift
+from nesy.perspective.operator import ImaginedPath, PerspectiveShift
 from nesy.report.figures import CELL_COLOURS
 from nesy.run_folder import RunFolder, read_json
 from nesy.world_model import SymbolicCodec, load_world_model

@@ -106,7 +106,7 @@ def _values(dbn: TwoSliceDBN, book: Codebook, factor: int, views: dict[str, int]
 
 def _rules(dbn: TwoSliceDBN, book: Codebook) -> list[list[dict[str, Any]]]:
     """Per factor: rules of the predicates that it tells most about, as texts."""
-    from nesy.asp.semantics import predicate_rules
+    from nesy.asp.semantics.predicates import predicate_rules
 
     gains = information(book.codes, book.predicates, dbn.num_values)
     wanted = [

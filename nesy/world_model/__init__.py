@@ -6,7 +6,7 @@ from nesy.world_model.networks import SymbolicWorldModel, WorldModel
 from nesy.world_model.paper import PaperWorldModel
 from nesy.world_model.storage import load_world_model, save_world_model
 from nesy.world_model.structure import Structure
-from nesy.world_model.training import train
+from nesy.world_model.training.loop import train
 
 __all__ = [
     "PaperWorldModel",

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from nesy.errors import UserError
-from nesy.experience import Experience, count_rows, held_out, parts_of, stream
+from nesy.log.experience import Experience, count_rows, held_out, parts_of, stream
 from nesy.world_model.distinct import Transitions, free_ahead, from_edges, view_keys
 
 CHUNK = 1 << 20
@@ -111,7 +111,7 @@ class Columns:
         return cls(np.concatenate(shown)[np.argsort(views.rank())], maps.keys, **rows)
 
     def held_out(self, fraction: float, rng: np.random.Generator) -> np.ndarray:
-        """Bool [M]: maps to keep out of training, drawn as `nesy.experience.held_out` draws them."""
+        """Bool [M]: maps to keep out of training, drawn as `nesy.log.experience.held_out` draws them."""
         return np.isin(self.maps, held_out(self.maps, fraction, rng))
 
     def rows(self, maps: np.ndarray) -> np.ndarray:

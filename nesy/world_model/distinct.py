@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from domains.core import Domain, DomainError
-from nesy.experience import Experience
+from nesy.log.experience import Experience
 
 
 @dataclass(frozen=True)

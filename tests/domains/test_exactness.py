@@ -12,8 +12,8 @@ from minigrid.core.world_object import Wall
 from minigrid.envs.crossing import CrossingEnv
 
 from domains.core import OUTCOMES
-from domains.person_following.map_generation import generate_crossing
-from domains.person_following.random_numbers import seeded_stream, stream_of, write_back
+from domains.person_following.simulation.map_generation import generate_crossing
+from domains.person_following.simulation.random_numbers import seeded_stream, stream_of, write_back
 from domains.person_following.variants import parameters_of
 from tests.domains.play import PLAYERS, compare_play
 from tests.domains.reference import Reference

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from domains import load_domain
-from domains.person_following.map_generation import generate_crossing
-from domains.person_following.random_numbers import seeded_stream
+from domains.person_following.simulation.map_generation import generate_crossing
+from domains.person_following.simulation.random_numbers import seeded_stream
 
 
 @pytest.fixture(scope="module")

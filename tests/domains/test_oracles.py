@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from domains import DomainError, load_domain
-from domains.person_following.bayes import BayesSearch
-from domains.person_following.beliefs import Belief, Worlds
-from domains.person_following.oracle_table import oracle_row
-from domains.person_following.person_chain import person_chains
+from domains.person_following.oracles.bayes import BayesSearch
+from domains.person_following.oracles.beliefs import Belief, Worlds
+from domains.person_following.oracles.oracle_table import oracle_row
+from domains.person_following.oracles.person_chain import person_chains
+from domains.person_following.oracles.wrong_models import egocentric_full_state
 from domains.person_following.variants import parameters_of
-from domains.person_following.wrong_models import egocentric_full_state
 
 
 def _worlds(variant, discount=0.9, **changes):

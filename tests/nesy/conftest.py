@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nesy.config import TrainConfig
-from nesy.experience import Experience
+from nesy.log.experience import Experience
 from nesy.world_model import SymbolicCodec, load_world_model, train
 
 SMALL = TrainConfig(epochs=6, batch_size=64, held_out=0.25, time_limit=0.0)

@@ -27,7 +27,7 @@ def measure(settings: Settings) -> list[Row]:
     for parents, limit in ((1, 50.0), (2, 50.0), (3, 500.0), (4, 500.0)):
         dbn = correlated_model(parents, settings.seed)
         for conclusion, what in (("X7!=7", "proof"), ("same", "counterexample")):
-            from nesy.asp.verification import verify
+            from nesy.asp.questions.verification import verify
 
             def ask(model: TwoSliceDBN = dbn, wanted: str = conclusion) -> Any:
                 return verify(model, None, 0, "X0!=7", wanted)
@@ -103,7 +103,7 @@ def _farthest(base: KnowledgeBase, rng: np.random.Generator) -> tuple[np.ndarray
 
     At most `PLAN` steps, from a few codes met; the goal is written as a condition.
     """
-    from nesy.dbn.inference import most_probable_next
+    from nesy.dbn.inference.exact import most_probable_next
 
     found: tuple[int, np.ndarray, np.ndarray] | None = None
     for start in base.book.codes[rng.integers(len(base.book), size=STARTS)]:

@@ -39,7 +39,7 @@ def measure(settings: Settings) -> list[Row]:
 
 
 def _random(rng: np.random.Generator, parents: int) -> Any:
-    from nesy.dbn.recovery import random_model
+    from nesy.dbn.evaluation.recovery import random_model
 
     return random_model(rng, parents=parents, actions=4)
 
@@ -53,7 +53,7 @@ def _codes(dbn: Any, rng: np.random.Generator, number: int) -> np.ndarray:
 
 def _one_step(dbn: Any, name: str, settings: Settings, rng: np.random.Generator) -> list[Row]:
     """Exact marginals after one step from certain codes; pyAgrum gets the same network of one action."""
-    from nesy.dbn.factored import FactoredUpdates
+    from nesy.dbn.inference.factored import FactoredUpdates
 
     codes = _codes(dbn, rng, BATCH)
     action = min(2, dbn.num_actions - 1)
@@ -107,7 +107,7 @@ def _filtering(dbn: Any, name: str, settings: Settings, rng: np.random.Generator
     From certain beliefs; from those of a filter that sees half of the factors at every step; from beliefs spread over
     all values of all factors.
     """
-    from nesy.dbn.factored import FactoredUpdates
+    from nesy.dbn.inference.factored import FactoredUpdates
 
     n, k = dbn.num_factors, dbn.num_values
     updates = FactoredUpdates(dbn)
@@ -137,7 +137,7 @@ def _filtering(dbn: Any, name: str, settings: Settings, rng: np.random.Generator
 def _large_files(rng: np.random.Generator) -> list[Row]:
     """A model of 20 factors x 16 values with 3 parents, written and read back; the peer is the limit of 10 s."""
     from nesy import formats
-    from nesy.dbn.recovery import random_model
+    from nesy.dbn.evaluation.recovery import random_model
 
     dbn = random_model(rng, factors=20, values=16, parents=3)
     rows = []
@@ -155,7 +155,7 @@ def _large_files(rng: np.random.Generator) -> list[Row]:
 
 def _recovered(settings: Settings) -> list[Row]:
     """Parents of random models of 8 x 8 with 2 parents from 20,000 transitions; the peer is the wanted 0.98."""
-    from nesy.dbn.recovery import recover
+    from nesy.dbn.evaluation.recovery import recover
 
     found = recover(range(settings.seed, settings.seed + 5))
     return [

@@ -16,7 +16,7 @@ from nesy.cli.benches.measuring import Row, Settings, ranked, rate
 
 if TYPE_CHECKING:
     from planners.config import DQNConfig
-    from planners.dqn import Training
+    from planners.dqn.dqn import Training
 
 NEEDS = ("train",)
 
@@ -28,7 +28,7 @@ def measure(settings: Settings) -> list[Row]:
     from domains.core import load_domain
     from nesy.world_model import SymbolicCodec, load_world_model
     from planners.config import DQNConfig
-    from planners.dqn import Training
+    from planners.dqn.dqn import Training
     from planners.perception import Perception
 
     torch.set_num_threads(1)

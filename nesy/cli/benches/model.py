@@ -27,7 +27,7 @@ def measure(settings: Settings) -> list[Row]:
     """
     import torch
 
-    from nesy.experience import load_columns
+    from nesy.log.experience import load_columns
     from nesy.world_model import PaperWorldModel, SymbolicCodec, load_world_model
 
     torch.set_num_threads(1)
@@ -136,7 +136,7 @@ def _codec(
 
 def _shifts(codec: SymbolicCodec, views: np.ndarray, configurations: np.ndarray, settings: Settings) -> list[Row]:
     """Perspective shifts: the published way one at a time, all pairs of the code book afresh, and from memory."""
-    from nesy.perspective import PerspectiveShift, imagine
+    from nesy.perspective.operator import PerspectiveShift, imagine
     from nesy.world_model import SymbolicCodec
 
     planner = "network" if codec.packed() is None else "table"

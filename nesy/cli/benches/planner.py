@@ -29,12 +29,12 @@ def measure(settings: Settings) -> list[Row]:
 
 
 def _factored(settings: Settings) -> list[Row]:
-    from nesy.dbn.kernels import packed
+    from nesy.dbn.inference.kernels import packed
     from nesy.dbn.model import TwoSliceDBN
-    from planners.code_sampling import sampler
-    from planners.random_bits import stream
-    from planners.tree import allocate, clear
-    from planners.walk import FactoredModel, walks
+    from planners.search.code_sampling import sampler
+    from planners.search.random_bits import stream
+    from planners.search.tree import allocate, clear
+    from planners.search.walk import FactoredModel, walks
 
     rng = np.random.default_rng(settings.seed)
     parents = [[tuple(rng.choice(_FACTORS, _PARENTS, replace=False)) for _ in range(_FACTORS)] for _ in range(_ACTIONS)]
@@ -60,7 +60,7 @@ def _factored(settings: Settings) -> list[Row]:
     name = f"{_FACTORS} x {_VALUES} factored model, {_PARENTS} parents, depth {_DEPTH}"
     peer = f"{name}: pomdp-py POUCT"
     rates = {
-        f"{name}: planners.walk": rate(ours, settings.seconds),
+        f"{name}: planners.search.walk": rate(ours, settings.seconds),
         peer: rate(theirs, settings.seconds),
     }
     rows = ranked("simulations/s", peer, rates)
@@ -71,8 +71,8 @@ def _pomdp_py_on_factors(model: Any, belief: np.ndarray, rng: np.random.Generato
     """A function that runs pomdp-py's POUCT on the same model and says how many simulations it was."""
     import pomdp_py
 
-    from planners.code_sampling import next_code
-    from planners.random_bits import stream, uniform
+    from planners.search.code_sampling import next_code
+    from planners.search.random_bits import stream, uniform
 
     actions = [pomdp_py.SimpleAction(str(a)) for a in range(_ACTIONS)]
     bits = stream(rng)
@@ -128,9 +128,9 @@ def _tiger(settings: Settings) -> list[Row]:
     import pomdp_py
 
     from domains.classic import tiger
-    from planners.pomdp import TabularPOMDP
-    from planners.pomdp_py_tabular import TabularAgent
-    from planners.search import TreeSearch
+    from planners.explicit.pomdp import TabularPOMDP
+    from planners.explicit.pomdp_py_tabular import TabularAgent
+    from planners.search.tree_search import TreeSearch
 
     rng = np.random.default_rng(settings.seed)
     model = TabularPOMDP(**tiger())
@@ -157,17 +157,17 @@ def _tiger(settings: Settings) -> list[Row]:
         return int(planner.last_num_sims)
 
     peer = f"tiger, depth {_DEPTH}: pomdp-py POUCT"
-    rates = {f"tiger, depth {_DEPTH}: planners.search": rate(ours, settings.seconds)}
+    rates = {f"tiger, depth {_DEPTH}: planners.search.tree_search": rate(ours, settings.seconds)}
     rates[peer] = rate(theirs, settings.seconds)
     return ranked("simulations/s", peer, rates)
 
 
 def _decision(settings: Settings) -> list[Row]:
-    from planners.beliefs import ParticleBelief
     from planners.config import SearchConfig
-    from planners.ialm import IALM
-    from planners.ialm_search import IALMSearch
-    from planners.kernels import compile_model
+    from planners.person_following.beliefs import ParticleBelief
+    from planners.person_following.ialm import IALM
+    from planners.person_following.ialm_search import IALMSearch
+    from planners.person_following.kernels import compile_model
 
     model, config = IALM.load(settings.run.ialm), SearchConfig()
     compiled, rng = compile_model(model), np.random.default_rng(settings.seed)

@@ -16,7 +16,7 @@ TITLE = "Symbolic 2DBN"
 def make(run: RunFolder, summary: dict[str, Any]) -> str:
     """Figures of the extraction, the graph, the parents and an excerpt of the tables."""
     from nesy.dbn import TwoSliceDBN, describe
-    from nesy.dbn.drawing import graph_figure
+    from nesy.dbn.reading.drawing import graph_figure
 
     dbn = TwoSliceDBN.load(run.dbn)
     rows = [

@@ -19,7 +19,7 @@ def make(run: RunFolder, summary: dict[str, Any]) -> str:
         return (
             f"<p>This run has no fidelity report; make one with <code>nesy extract --run {run.path} --redo</code></p>"
         )
-    from nesy.dbn.fidelity_drawing import fidelity_figure
+    from nesy.dbn.reading.fidelity_drawing import fidelity_figure
 
     picture = figure(
         figures.svg(fidelity_figure(report)),

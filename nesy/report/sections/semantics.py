@@ -87,7 +87,7 @@ def _factor(name: str, factor: int, book: Any, each: dict[str, Any]) -> str:
 
 def _picture(views: np.ndarray, label: str) -> str:
     """The mean colours of some views as inline SVG, the viewer at the bottom."""
-    from nesy.dbn.drawing import mean_view
+    from nesy.dbn.reading.drawing import mean_view
 
     colours = (mean_view(views) * 255).round().astype(int)
     width, height = colours.shape[:2]

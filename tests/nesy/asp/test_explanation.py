@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nesy.asp import KnowledgeBase
-from nesy.asp.explanation import explain_step
+from nesy.asp.questions.explanation import explain_step
 from nesy.errors import UserError
 from tests.nesy.dbn.models import random_dbn
 from tests.nesy.dbn.toy import toy

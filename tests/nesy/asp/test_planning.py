@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nesy.asp import KnowledgeBase
-from nesy.asp.aftermath import after
-from nesy.asp.planning import PredicateTruth, find_plan
+from nesy.asp.questions.aftermath import after
+from nesy.asp.questions.planning import PredicateTruth, find_plan
 from nesy.errors import UserError
 from tests.nesy.dbn.models import all_codes, random_dbn, transition_matrix
 from tests.nesy.dbn.toy import toy

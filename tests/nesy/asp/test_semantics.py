@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nesy.asp import KnowledgeBase
-from nesy.asp.induction import induce
-from nesy.asp.minimal import minimal_form
-from nesy.asp.rules import applies, asp_value_rules
-from nesy.asp.semantic_scores import folds, map_folds, maps_of, scores
-from nesy.asp.semantics import determined, ordered, predicate_rules, value_rules
+from nesy.asp.semantics.induction import induce
+from nesy.asp.semantics.minimal import minimal_form
+from nesy.asp.semantics.predicates import determined, ordered, predicate_rules, value_rules
+from nesy.asp.semantics.rules import applies, asp_value_rules
+from nesy.asp.semantics.scores import folds, map_folds, maps_of, scores
 from nesy.dbn.codebook import Codebook
 from nesy.dbn.model import TwoSliceDBN
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from nesy.asp.validity import plan_validity
+from nesy.asp.questions.validity import plan_validity
 from nesy.errors import UserError
 from tests.nesy.dbn.real import real_model
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nesy.asp.verification import verify
+from nesy.asp.questions.verification import verify
 from nesy.dbn.codebook import Codebook
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
@@ -45,7 +45,7 @@ def test_verdicts_are_those_of_enumeration(seed):
     action = int(rng.integers(2))
     with pytest.MonkeyPatch.context() as patch:
         if seed % 2:
-            patch.setattr("nesy.asp.verification.try_steps", lambda *arguments: None)
+            patch.setattr("nesy.asp.questions.verification.try_steps", lambda *arguments: None)
         verdict = verify(dbn, None, action, premise, conclusion)
     codes, matrix = all_codes(dbn), transition_matrix(dbn, action)
     breaks = [
@@ -87,7 +87,7 @@ def test_verdicts_about_predicates_are_those_of_enumeration(seed, over, without_
     premise, conclusion = some(False), some(True)
     with pytest.MonkeyPatch.context() as patch:
         if without_tries:
-            patch.setattr("nesy.asp.verification.try_steps", lambda *arguments: None)
+            patch.setattr("nesy.asp.questions.verification.try_steps", lambda *arguments: None)
         verdict = verify(dbn, book, 0, ", ".join(premise), ", ".join(conclusion), codes=over)
     rules = {found.target: found for found in verdict.rules}
 

@@ -12,9 +12,9 @@ from nesy.run_folder import RunFolder, write_json
 def extracted_run():
     """A run folder with little experience, a world model trained for one epoch, and its 2DBN."""
     from domains.core import load_domain
-    from nesy.collection import collect
-    from nesy.dbn.extraction import extract_run
-    from nesy.experience import Experience
+    from nesy.dbn.learning.extraction import extract_run
+    from nesy.log.collection import collect
+    from nesy.log.experience import Experience
     from nesy.world_model import train
 
     folder = tempfile.TemporaryDirectory()

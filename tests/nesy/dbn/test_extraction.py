@@ -5,7 +5,7 @@ import pytest
 
 from nesy.config import CollectConfig, ExtractConfig
 from nesy.dbn.codebook import Codebook
-from nesy.dbn.extraction import extract_run
+from nesy.dbn.learning.extraction import extract_run
 from nesy.dbn.model import TwoSliceDBN
 from nesy.run_folder import RunFolder, write_json
 
@@ -16,7 +16,7 @@ def paper_run(tmp_path_factory):
     import torch
 
     from domains.core import load_domain
-    from nesy.collection import collect
+    from nesy.log.collection import collect
     from nesy.world_model.paper import PaperWorldModel
     from nesy.world_model.storage import save_world_model
 

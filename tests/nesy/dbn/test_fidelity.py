@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from nesy.dbn.fidelity import held_out, network_nll
-from nesy.dbn.fidelity_drawing import draw_fidelity
-from nesy.dbn.recovery import Recovery
-from nesy.dbn.thumbnails import thumbnails
-from nesy.dbn.validity import commonest_successors, likeliest_successors, shortest_plan
+from nesy.dbn.evaluation.fidelity import held_out, network_nll
+from nesy.dbn.evaluation.recovery import Recovery
+from nesy.dbn.evaluation.validity import commonest_successors, likeliest_successors, shortest_plan
+from nesy.dbn.reading.fidelity_drawing import draw_fidelity
+from nesy.dbn.reading.thumbnails import thumbnails
 from nesy.errors import UserError
 from tests.nesy.dbn.toy import Network, experience, toy
 

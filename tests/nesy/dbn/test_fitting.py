@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from nesy.dbn.extraction import extract
-from nesy.dbn.fitting import from_callable, from_experience
-from nesy.dbn.measures import fidelity
-from nesy.dbn.recovery import compare_arcs, random_model, random_transitions, recover
-from nesy.dbn.structure import Search
+from nesy.dbn.evaluation.measures import fidelity
+from nesy.dbn.evaluation.recovery import compare_arcs, random_model, random_transitions, recover
+from nesy.dbn.learning.extraction import extract
+from nesy.dbn.learning.fitting import from_callable, from_experience
+from nesy.dbn.learning.structure import Search
 from nesy.errors import UserError
 from tests.nesy.dbn.models import random_dbn
 from tests.nesy.dbn.toy import Network, experience, toy
@@ -152,7 +152,7 @@ def test_distinct_rows_are_numpy_s(width):
 
 
 def test_distinct_transitions_stand_for_all():
-    from nesy.dbn.extraction import with_counts
+    from nesy.dbn.learning.extraction import with_counts
 
     taken = experience()
     codes, actions, later, counts = taken.distinct()

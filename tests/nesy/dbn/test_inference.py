@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nesy.dbn import inference
-from nesy.dbn.factored import FactoredUpdates
-from nesy.dbn.kernels import packed, sample_codes
+from nesy.dbn.inference import exact as inference
+from nesy.dbn.inference.factored import FactoredUpdates
+from nesy.dbn.inference.kernels import packed, sample_codes
 from nesy.errors import UserError
 from tests.nesy.dbn.models import all_codes, joint, marginals_of, random_dbn, transition_matrix
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nesy.dbn.particles import ParticleFilter
+from nesy.dbn.inference.particles import ParticleFilter
 from nesy.errors import UserError
 from tests.nesy.dbn.models import all_codes, marginals_of, random_dbn, transition_matrix
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nesy.dbn.inference import plan_marginals
+from nesy.dbn.inference.exact import plan_marginals
+from nesy.dbn.inference.plans import follow, reached
+from nesy.dbn.learning.step_learning import with_observation, with_outcomes
 from nesy.dbn.model import TwoSliceDBN
 from nesy.dbn.parts import cone_of, known_part
-from nesy.dbn.plans import follow, reached
-from nesy.dbn.step_learning import with_observation, with_outcomes
 from nesy.dbn.step_tables import StepTable
 from nesy.errors import UserError
 from tests.nesy.dbn.models import random_dbn

@@ -9,13 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nesy.dbn import describe
-from nesy.dbn.drawing import draw_factor, draw_graph, mean_view
+from nesy.dbn.evaluation.measures import row_differences, unknown_code_rate
+from nesy.dbn.evaluation.rollouts import rollout_drift
 from nesy.dbn.graph import arc_strength
-from nesy.dbn.measures import row_differences, unknown_code_rate
 from nesy.dbn.model import TwoSliceDBN
-from nesy.dbn.rollouts import rollout_drift
-from nesy.dbn.step_reading import describe_step_table
-from nesy.dbn.trees import conditional_tree, describe_tree, look_up
+from nesy.dbn.reading.drawing import draw_factor, draw_graph, mean_view
+from nesy.dbn.reading.step_text import describe_step_table
+from nesy.dbn.reading.trees import conditional_tree, describe_tree, look_up
 from nesy.errors import UserError
 from tests.nesy.dbn.models import all_codes, random_dbn
 from tests.nesy.dbn.steps import with_steps

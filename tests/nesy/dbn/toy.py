@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from nesy.dbn.codebook import Codebook, value_meanings
-from nesy.dbn.extraction import Transitions, extract
+from nesy.dbn.learning.extraction import Transitions, extract
 from nesy.dbn.model import TwoSliceDBN
 
 

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from nesy import formats
-from nesy.dbn.inference import plan_marginals
+from nesy.dbn.inference.exact import plan_marginals
+from nesy.dbn.inference.plans import follow, reached
 from nesy.dbn.model import TwoSliceDBN
 from nesy.dbn.parts import known_part
-from nesy.dbn.plans import follow, reached
-from nesy.formats import agreement
-from nesy.formats.agreement import by_pyagrum, by_storm
 from nesy.formats.bayes_nodes import node_names
+from nesy.formats.programs import agreement
+from nesy.formats.programs.agreement import by_pyagrum, by_storm
 from tests.nesy.dbn.extracted import extracted_run
 from tests.nesy.dbn.models import random_dbn
 from tests.nesy.dbn.steps import with_steps

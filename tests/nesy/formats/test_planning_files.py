@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from nesy import formats
-from nesy.dbn.inference import most_probable_next
+from nesy.dbn.inference.exact import most_probable_next
 from nesy.errors import UserError
-from nesy.formats.execution import by_fast_downward, execute
+from nesy.formats.programs.execution import by_fast_downward, execute
 from nesy.formats.rddl import MAX_ENTRIES
 from tests.nesy.dbn.extracted import extracted_run
 from tests.nesy.dbn.models import all_codes, random_dbn, transition_matrix

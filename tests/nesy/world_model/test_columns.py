@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nesy.errors import UserError
-from nesy.experience import COLUMNS, Experience, write_part
+from nesy.log.experience import COLUMNS, Experience, write_part
 from nesy.world_model import columns as module
 from nesy.world_model.columns import Columns
 from nesy.world_model.distinct import Transitions, transitions_of

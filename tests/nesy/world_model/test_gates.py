@@ -5,7 +5,7 @@ import pytest
 
 from nesy.world_model import SymbolicCodec
 from nesy.world_model.distinct import Transitions, transitions_of, unobstructed, view_keys, with_mirror
-from nesy.world_model.gates import evaluate, limits, view_gates
+from nesy.world_model.training.gates import evaluate, limits, view_gates
 
 
 def test_limits_by_hand() -> None:

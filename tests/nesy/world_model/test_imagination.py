@@ -2,11 +2,11 @@ import dataclasses
 
 import numpy as np
 
-from nesy.experience import Experience
+from nesy.log.experience import Experience
 from nesy.world_model import SymbolicCodec
 from nesy.world_model.columns import Columns
 from nesy.world_model.distinct import free_ahead
-from nesy.world_model.imagination import imagined_rollouts, starts_of
+from nesy.world_model.training.imagination import imagined_rollouts, starts_of
 
 
 def episodes_of(toy: Experience, length: int) -> Columns:

@@ -7,7 +7,7 @@ from types import ModuleType
 
 import pytest
 
-from nesy.experience import COLUMNS, Experience, write_part
+from nesy.log.experience import COLUMNS, Experience, write_part
 from tests.nesy.conftest import SMALL
 
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from nesy.world_model.code_search import CodeSearch
-from nesy.world_model.counting import count, edges_of, families_of, logs_up_to
+from nesy.world_model.codes.code_search import CodeSearch
+from nesy.world_model.codes.counting import count, edges_of, families_of, logs_up_to
+from nesy.world_model.codes.questions import GroupSearch, Questions
+from nesy.world_model.codes.refinement import Refiner
+from nesy.world_model.codes.telling import telling_cost
 from nesy.world_model.distinct import transitions_of, with_mirror
-from nesy.world_model.questions import GroupSearch, Questions
-from nesy.world_model.refinement import Refiner
 from nesy.world_model.structure import Limits
-from nesy.world_model.telling import telling_cost
 from tests.nesy.conftest import toy_experience
 
 

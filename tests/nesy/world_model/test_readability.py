@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from nesy.world_model.readability import readability
+from nesy.world_model.codes.readability import readability
 
 
 def test_fewest_factors_and_information_by_hand() -> None:

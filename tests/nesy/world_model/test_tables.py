@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nesy.world_model import Structure, SymbolicCodec, SymbolicWorldModel
-from nesy.world_model.refinement import Refiner, separate
+from nesy.world_model.codes.refinement import Refiner, separate
 from nesy.world_model.rolling import Rollout
 from nesy.world_model.structure import Limits, search
 from nesy.world_model.successors import most_probable, pack, successors

@@ -56,7 +56,7 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
 def test_resume_gives_the_same_weights_bit_for_bit(
     architecture: str, tmp_path: Path, trained: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("nesy.world_model.paper_training.STEPS", 8)
+    monkeypatch.setattr("nesy.world_model.training.paper_training.STEPS", 8)
     config = SMALL if architecture == "symbolic" else TrainConfig(architecture="paper", epochs=3, batch_size=16)
     experience = toy_experience()
     whole = trained
@@ -142,7 +142,7 @@ def test_every_epoch_of_the_network_has_all_gates_on_held_out_maps(trained: Path
 
 
 def test_where_views_are_many_gradients_alone_do_it(tmp_path: Path, toy, monkeypatch: pytest.MonkeyPatch) -> None:  # type: ignore[no-untyped-def]
-    monkeypatch.setattr("nesy.world_model.symbolic_training.REFINE_UP_TO", 1)
+    monkeypatch.setattr("nesy.world_model.training.symbolic_training.REFINE_UP_TO", 1)
     metrics = train(toy, SMALL, tmp_path, seed=1)
     lines = lines_of(tmp_path)
     assert [line["stage"] for line in lines] == ["network"] * SMALL.epochs + ["fit"] * SMALL.epochs
@@ -154,7 +154,7 @@ def test_where_views_are_many_gradients_alone_do_it(tmp_path: Path, toy, monkeyp
 
 
 def test_another_search_where_the_first_predicts_too_badly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nesy.world_model.symbolic_training.ENOUGH", -1.0)  # no book is good enough
+    monkeypatch.setattr("nesy.world_model.training.symbolic_training.ENOUGH", -1.0)  # no book is good enough
     experience, whole, cut = toy_experience(), tmp_path / "whole", tmp_path / "cut"
     train(experience, SMALL, whole, seed=1)
     lines = lines_of(whole)

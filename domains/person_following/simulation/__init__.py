@@ -1,0 +1,1 @@
+"""The rules as compiled kernels: maps, people, paths, views, and batches of episodes."""

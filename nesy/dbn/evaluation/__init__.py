@@ -1,0 +1,1 @@
+"""How well a 2DBN predicts: fidelity, recovery of known structures, roll-outs, the validity of codes."""

@@ -1,0 +1,1 @@
+"""Inference in a 2DBN: exact, factored, sampled; plans of actions."""

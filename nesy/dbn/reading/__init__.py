@@ -1,0 +1,1 @@
+"""A 2DBN for people: text, trees, graphs, pictures."""

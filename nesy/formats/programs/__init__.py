@@ -1,0 +1,1 @@
+"""Independent programs that read our files: Storm, pyAgrum, Fast Downward."""

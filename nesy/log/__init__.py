@@ -1,0 +1,1 @@
+"""Experience: transitions in columns, collected in resumable shards."""

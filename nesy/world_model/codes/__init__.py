@@ -1,0 +1,1 @@
+"""The search for a code book: which factors a view has, and which values."""

@@ -1,0 +1,1 @@
+"""Training of the world model, its gates, its logs."""

@@ -1,0 +1,1 @@
+"""The belief DQN: learner, replay buffer, checkpoints, and what the published code does otherwise."""

@@ -1,0 +1,1 @@
+"""Learned tables that models are made of."""

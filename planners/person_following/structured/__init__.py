@@ -1,0 +1,1 @@
+"""Hand-structured local models of person following: the agent `structured`."""

@@ -1,0 +1,1 @@
+"""Tree search: one simulation kernel, PO-UCT, search with bounds, drawings."""
