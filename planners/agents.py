@@ -12,11 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 
 from domains.core import BatchedEnvironment, ViewGeometry
-from planners.config import SearchConfig
 from planners.perception import Percepts
-from planners.person_following.beliefs import ParticleBelief
-from planners.person_following.ialm import IALM
-from planners.person_following.kernels import compile_model
 
 if TYPE_CHECKING:
     from planners.dqn.dqn import DQNPolicy  # imports torch
@@ -139,32 +135,3 @@ class BeliefAgent:
 
     def _planner(self, rng: np.random.Generator) -> Any:
         raise NotImplementedError
-
-
-class PlanningAgent(BeliefAgent):
-    """Keeps particles of the local model and plans with pomdp-py's POUCT, QMDP or our own search."""
-
-    def __init__(self, kind: str, model: IALM, config: SearchConfig, geometry: ViewGeometry, seed: int) -> None:
-        super().__init__(geometry, seed)
-        self.kind, self.model, self.config = kind, model, config
-        self.compiled = compile_model(model)
-
-    def _told(self, situation: Situation) -> np.ndarray:
-        assert situation.percepts is not None
-        return situation.percepts.shifted
-
-    def _belief(self, rng: np.random.Generator) -> ParticleBelief:
-        return ParticleBelief(self.model, self.compiled, self.config.particles, rng)
-
-    def _planner(self, rng: np.random.Generator) -> Planner:
-        if self.kind == "pomdp":
-            from planners.person_following.pomdp_py_adapter import POUCTAgent
-
-            return POUCTAgent(self.model, self.compiled, self.config, rng)
-        if self.kind == "qmdp":
-            from planners.person_following.qmdp import LocalQMDP
-
-            return LocalQMDP(self.model, self.compiled, self.config, rng)
-        from planners.person_following.ialm_search import IALMSearch
-
-        return IALMSearch(self.model, self.compiled, self.config, rng)

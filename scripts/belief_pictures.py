@@ -17,9 +17,10 @@ import numpy as np
 
 from domains.core import load_domain
 from nesy.run_folder import RunFolder, atomic_path
-from planners.agents import PlanningAgent, Situation
+from planners.agents import Situation
 from planners.config import INFLUENCE_MODES, SearchConfig
 from planners.perception import Perception
+from planners.person_following.agent import PlanningAgent
 from planners.person_following.ialm import IALM
 
 

@@ -26,8 +26,8 @@ from domains.core import load_domain
 from nesy.report.comparison_figures import save
 from nesy.run_folder import RunFolder, read_json, write_json
 from planners.agents import DQNAgent
-from planners.comparison.compare import EVALUATION_SEED
 from planners.comparison.evaluation import Player, evaluate
+from planners.comparison.grid import EVALUATION_SEED
 from planners.comparison.results import map_optimum
 from planners.comparison.statistics import over_seeds
 from planners.config import DQNConfig

@@ -71,7 +71,7 @@ def loaders() -> tuple[Loader, ...]:
     from nesy.report.sections import provenance, world_model
     from nesy.run_folder import RunFolder
     from nesy.world_model import load_world_model
-    from planners.comparison.replay import load_replays
+    from planners.comparison.replay.record import load_replays
     from planners.dqn.dqn import DQNPolicy
     from planners.explicit.pomdp import TabularPOMDP
     from planners.person_following.ialm import IALM

@@ -27,11 +27,11 @@ from nesy.log.collection import collect_following
 from nesy.log.experience import Experience
 from nesy.run_folder import RunFolder
 from nesy.world_model import SymbolicCodec, load_world_model
-from planners.agents import PlanningAgent
 from planners.comparison.evaluation import Player, evaluate
 from planners.comparison.statistics import bootstrap
 from planners.config import SearchConfig
 from planners.perception import Perception
+from planners.person_following.agent import PlanningAgent
 from planners.person_following.ialm import IALM, WAIT
 from planners.person_following.ialm_learning import learn_ialm
 from planners.person_following.influence_rules import constrain_influence

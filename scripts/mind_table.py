@@ -23,8 +23,9 @@ from scipy.stats import t as student
 from domains.core import load_domain
 from nesy.cli.configuration import load
 from nesy.run_folder import RunFolder, atomic_path
-from planners.comparison.compare import Cell, ensure_ialm
 from planners.comparison.evaluation import Player
+from planners.comparison.grid import Cell
+from planners.comparison.model_store import ModelStore
 from planners.comparison.players import build_player, restored_player
 from planners.config import INFLUENCE_MODES
 
@@ -45,7 +46,7 @@ def main() -> None:
     run, domain = RunFolder.open(arguments.run), load_domain()
     config = load(run.config)
     variant = arguments.variant or config.variant
-    ensure_ialm(run, domain, variant, config.compare.search, config.seed)
+    ModelStore(run).learn(domain, variant, config.compare.search, config.seed)
     grids, own, weights = worlds(domain, variant)
     rows: dict[str, dict[str, Any]] = {}
 

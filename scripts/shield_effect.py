@@ -24,12 +24,13 @@ from nesy.cli import configuration
 from nesy.progress import ConsoleProgress
 from nesy.run_folder import RunFolder
 from nesy.world_model import SymbolicCodec, load_world_model
-from planners.agents import Agent, DQNAgent, PlanningAgent
+from planners.agents import Agent, DQNAgent
 from planners.comparison.evaluation import Player, evaluate
 from planners.comparison.statistics import bootstrap
 from planners.config import DQNConfig, SearchConfig
 from planners.dqn.dqn import Training, train
 from planners.perception import Perception
+from planners.person_following.agent import PlanningAgent
 from planners.person_following.ialm import IALM
 from planners.shielding import ShieldMask
 

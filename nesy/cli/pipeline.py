@@ -327,7 +327,7 @@ class Pipeline:
 
     def _record_replays(self) -> None:
         """Play a few episodes of the comparison again for the report, unless that has been done."""
-        from planners.comparison.replay import record_replays
+        from planners.comparison.replay.record import record_replays
 
         record_replays(self.run, self.config.compare, self.config.seed, self.progress, self.config.domain)
 

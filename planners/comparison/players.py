@@ -12,14 +12,16 @@ from domains.core import Domain
 from nesy.progress import SILENT, Progress
 from nesy.run_folder import RunFolder
 from planners import config as settings
-from planners.agents import Agent, DQNAgent, PlanningAgent
+from planners.agents import Agent, DQNAgent
 from planners.baselines import LastSeenFollower, OptimalAgent, OracleFollower, RandomAgent
 from planners.comparison.evaluation import Columns, Player
-from planners.config import CompareConfig, SearchConfig
+from planners.comparison.grid import Cell
+from planners.comparison.model_store import ModelStore
+from planners.config import CompareConfig
 from planners.perception import Codec, Perception
+from planners.person_following.agent import PlanningAgent
 
 if TYPE_CHECKING:
-    from planners.comparison.compare import Cell
     from planners.person_following.ialm import IALM
     from planners.shielding import ActionMask
 
@@ -48,19 +50,21 @@ def build_player(
     checkpoint: Path | None = None,
 ) -> Built:
     """The cell's player; a learner is trained, from `checkpoint` on where that file is."""
-    own_seed = cell_seed(cell, seed)
+    own_seed, store = cell_seed(cell, seed), ModelStore(run)
     if cell.agent in settings.REFERENCE_AGENTS:
         agent = _reference(cell, domain, own_seed)
         if not config.rules:
             return Built(Player(agent), None, 0)
-        codec = load_codec(run)  # only to tell in which situation a rule applies
+        codec: Codec = store.codec  # only to tell in which situation a rule applies
         return Built(Player(agent, None, action_mask(config, codec, domain), codec), None, 0)
-    codec = load_codec(run)
+    codec = store.codec
     mask = action_mask(config, codec, domain)
     if cell.agent in settings.PLANNING_AGENTS:
         perception = Perception(codec, cell.influence, np.random.default_rng([own_seed, 1]))
-        planner = _planner(cell, run, domain, config, own_seed, codec)
-        return Built(Player(planner, perception, mask), None, _practised(cell, run, config.search_of_cells))
+        planner = _planner(cell, store, domain, config, own_seed)
+        return Built(
+            Player(planner, perception, mask), None, store.practice_steps(cell.variant, config.search_of_cells)
+        )
     if cell.policy:
         return _stored(cell, Path(cell.policy), codec, mask, own_seed)
     from planners.dqn.dqn import Training, train
@@ -83,7 +87,7 @@ def restored_player(cell: Cell, run: RunFolder, domain: Domain, config: CompareC
     """
     if cell.agent in (*settings.REFERENCE_AGENTS, *settings.PLANNING_AGENTS):
         return build_player(cell, run, domain, config, seed).player
-    codec = load_codec(run)
+    codec = ModelStore(run).codec
     path = Path(cell.policy) if cell.policy else run.policies / f"{cell.name}.safetensors"
     return _stored(cell, path, codec, action_mask(config, codec, domain), cell_seed(cell, seed)).player
 
@@ -102,7 +106,7 @@ def agent_from_file(path: Path, run: RunFolder | None = None) -> tuple[DQNAgent,
     from planners.dqn.published import dqn_perception
 
     policy = DQNPolicy.load(path)
-    codec = load_codec(run or RunFolder(path.resolve().parent.parent))
+    codec = ModelStore(run or RunFolder(path.resolve().parent.parent)).codec
     influence = str(policy.trained.get("influence", "perspective-shift"))
     return DQNAgent(policy), dqn_perception(codec, influence, np.random.default_rng(0), policy.config)
 
@@ -121,13 +125,6 @@ def cell_seed(cell: Cell, seed: int) -> int:
     return int(np.random.SeedSequence([seed, cell.seed, *cell.name.encode()]).generate_state(1)[0])
 
 
-def load_codec(run: RunFolder) -> Codec:
-    """What turns views into codes, by the run's world model."""
-    from nesy.world_model import SymbolicCodec, load_world_model
-
-    return SymbolicCodec(load_world_model(run.world_model))
-
-
 def _stored(cell: Cell, path: Path, codec: Codec, mask: ActionMask | None, own_seed: int) -> Built:
     """A trained policy from its file, perceiving as it did when it was trained."""
     from planners.dqn.dqn import DQNPolicy
@@ -138,48 +135,32 @@ def _stored(cell: Cell, path: Path, codec: Codec, mask: ActionMask | None, own_s
     return Built(Player(DQNAgent(policy), perception, mask), None, int(policy.trained.get("steps", 0)))
 
 
-def _planner(cell: Cell, run: RunFolder, domain: Domain, config: CompareConfig, seed: int, codec: Codec) -> Agent:
-    from planners.comparison.compare import ialm_folder, load_ialm
-
-    home = ialm_folder(run, cell.variant)
-    model = plain = load_ialm(run, cell.variant)
+def _planner(cell: Cell, store: ModelStore, domain: Domain, config: CompareConfig, seed: int) -> Agent:
+    codec, search, geometry = store.codec, config.search_of_cells, domain.spec.geometry
+    model = plain = store.local_model(cell.variant)
     if config.rules:
         from planners.person_following.influence_rules import constrain_influence
 
         model, _ = constrain_influence(model, [Path(rule) for rule in config.rules], codec, domain)
-    if cell.agent == "search" and (home / "minds.json").is_file():
-        from planners.person_following.structured.known_maps.mind_agent import MindAgent
-        from planners.person_following.structured.known_maps.minds import MindModel
+    structured = store.structured_model(cell.variant) if cell.agent == "search" else None
+    if structured is None:
+        return PlanningAgent(cell.agent, model, search, geometry, seed)
+    possible = None if model is plain else _possible(model, plain)
+    from planners.person_following.structured.drawn_maps.mapped_agent import MappedAgent
+    from planners.person_following.structured.known_maps.mind_agent import MindAgent
+    from planners.person_following.structured.known_maps.minds import MindModel
 
-        minds = MindModel.load(home)
-        agent = MindAgent(minds, codec, cell.influence, config.search_of_cells, domain.spec.geometry, seed)
-        if model is not plain:
-            agent.ways.constrain(_possible(model, plain)(agent.ways.codes))
+    if isinstance(structured, MindModel):
+        agent = MindAgent(structured, codec, cell.influence, search, geometry, seed)
+        if possible is not None:
+            agent.ways.constrain(possible(agent.ways.codes))
         return agent
-    if cell.agent == "search" and (home / "mapped.json").is_file():
-        from planners.person_following.structured.drawn_maps.mapped_agent import MappedAgent
-        from planners.person_following.structured.drawn_maps.mapped_model import MappedModel
-
-        possible = None if model is plain else _possible(model, plain)
-        mapped = MappedModel.load(home)
-        return MappedAgent(mapped, codec, cell.influence, config.search_of_cells, domain.spec.geometry, seed, possible)
-    return PlanningAgent(cell.agent, model, config.search_of_cells, domain.spec.geometry, seed)
+    return MappedAgent(structured, codec, cell.influence, search, geometry, seed, possible)
 
 
 def _possible(model: IALM, plain: IALM) -> Callable[[np.ndarray], np.ndarray]:
     """Which moves rules leave to persons with codes [n, N], from the model with them and without: bool [n, moves]."""
     return lambda codes: (model.influence_of(codes) > 0) | (plain.influence_of(codes) <= 0)
-
-
-def _practised(cell: Cell, run: RunFolder, config: SearchConfig) -> int:
-    """Environment steps of the practice that the planner's model was learned from."""
-    import pyarrow.parquet as pq
-
-    from planners.comparison.compare import ialm_folder
-
-    shards = (ialm_folder(run, cell.variant) / "practice").glob("part-*.parquet")
-    rows = sum(pq.read_metadata(path).num_rows for path in shards)
-    return min(rows, config.practice_steps or rows)
 
 
 def _reference(cell: Cell, domain: Domain, seed: int) -> Agent:

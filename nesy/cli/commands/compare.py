@@ -54,12 +54,13 @@ def check_rules(options: Arguments) -> None:
         UserError: a rule is wrong; the run has no world model yet.
     """
     from domains.core import load_domain
-    from planners.comparison.players import action_mask, load_codec
+    from planners.comparison.model_store import ModelStore
+    from planners.comparison.players import action_mask
 
     run = RunFolder.open(options.run)
     run.require("collect", "train", "extract")
     domain = load_domain(pipeline.config_of(options).domain)
-    action_mask(options.settings, load_codec(run), domain)
+    action_mask(options.settings, ModelStore(run).codec, domain)
 
 
 def show(result: dict[str, Any]) -> None:

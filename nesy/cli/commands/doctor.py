@@ -208,7 +208,7 @@ def _files(folder: Any, missing: list[str]) -> Iterator[Check]:
     def compare() -> str:
         import pyarrow.parquet as pq
 
-        from planners.comparison.replay import load_replays
+        from planners.comparison.replay.record import load_replays
         from planners.dqn.dqn import DQNPolicy
         from planners.person_following.ialm import IALM
 

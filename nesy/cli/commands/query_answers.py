@@ -106,7 +106,7 @@ def _why(knowledge: KnowledgeBase, options: Arguments) -> dict[str, Any]:
     from nesy.asp.semantics.rules import applies, sentence
     from nesy.cli import configuration
     from nesy.run_folder import RunFolder
-    from planners.comparison.choices import explain_choice, find_cell
+    from planners.comparison.replay.why import explain_choice, find_cell
 
     run = RunFolder.open(options.run)
     config = configuration.load(run.config)

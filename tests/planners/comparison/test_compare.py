@@ -13,9 +13,10 @@ from domains.person_following.metrics import BELIEF_METRICS, METRICS
 from nesy.errors import UserError
 from nesy.run_folder import RunFolder, read_json
 from planners.baselines import LastSeenFollower, OracleFollower
-from planners.comparison.choices import find_cell
-from planners.comparison.compare import EVALUATION_SEED, compare, grid
+from planners.comparison.compare import compare
 from planners.comparison.evaluation import Player, evaluate
+from planners.comparison.grid import EVALUATION_SEED, grid
+from planners.comparison.replay.why import find_cell
 from planners.comparison.results import _interval
 from planners.config import CompareConfig, DQNConfig, SearchConfig
 

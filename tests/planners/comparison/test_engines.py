@@ -16,7 +16,7 @@ import pytest
 from nesy.errors import UserError
 from nesy.run_folder import RunFolder
 from planners.comparison.compare import compare
-from planners.comparison.engines import Tally
+from planners.comparison.engines.jobs import Tally
 from planners.config import CompareConfig, DQNConfig
 
 REFERENCES = CompareConfig(agents=("greedy-follower", "random", "greedy-last-seen"), episodes=84, seeds=(0, 1))

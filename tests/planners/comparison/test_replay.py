@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from nesy.errors import UserError
-from planners.comparison.compare import Cell
-from planners.comparison.replay import load_replays
-from planners.comparison.replay_choice import choose
+from planners.comparison.grid import Cell
+from planners.comparison.replay.choice import choose
+from planners.comparison.replay.record import load_replays
 
 
 def cell(agent: str) -> Cell:

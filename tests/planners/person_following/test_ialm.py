@@ -10,7 +10,7 @@ import pytest
 
 from nesy.errors import UserError
 from nesy.run_folder import RunFolder
-from planners.comparison.compare import ialm_folder, load_ialm
+from planners.comparison.model_store import ModelStore
 from planners.person_following import ialm, kernels
 from planners.person_following.beliefs import ParticleBelief
 from planners.person_following.ialm import IALM, SCALARS
@@ -217,9 +217,9 @@ def test_a_run_holds_models_of_several_variants(tmp_path: Path) -> None:
     run, first, second = RunFolder(tmp_path), small_ialm(7), small_ialm(8)
     first.dbn.save(run.dbn)
     for variant, model in (("paper", first), ("intent", second)):
-        replace(model, dbn=first.dbn, provenance={"variant": variant}).save(ialm_folder(run, variant))
+        replace(model, dbn=first.dbn, provenance={"variant": variant}).save(ModelStore(run).folder(variant))
     for variant in ("paper", "intent"):
-        assert load_ialm(run, variant).provenance == {"variant": variant}
+        assert ModelStore(run).local_model(variant).provenance == {"variant": variant}
 
 
 def test_damaged_files_are_named(tmp_path: Path) -> None:

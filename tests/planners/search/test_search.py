@@ -11,11 +11,12 @@ import pytest
 
 from domains.classic import tiger
 from domains.core import ViewGeometry
-from planners.agents import PlanningAgent, Situation
+from planners.agents import Situation
 from planners.config import CompareConfig, SearchConfig
 from planners.explicit.pomdp import TabularPOMDP
 from planners.perception import Percepts
 from planners.person_following import kernels
+from planners.person_following.agent import PlanningAgent
 from planners.person_following.ialm_search import IALMSearch
 from planners.person_following.pomdp_py_adapter import LocalEnvironment, LocalState, POUCTAgent, RobotAction, RobotAgent
 from planners.person_following.qmdp import LocalQMDP, TabularQMDP

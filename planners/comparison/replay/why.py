@@ -17,8 +17,8 @@ from domains.core import Domain
 from nesy.errors import UserError
 from nesy.run_folder import RunFolder
 from planners.agents import DQNAgent, Situation
-from planners.comparison.compare import Cell, grid
 from planners.comparison.evaluation import permitted
+from planners.comparison.grid import Cell, grid
 from planners.comparison.players import restored_player
 from planners.config import CompareConfig
 from planners.perception import Percepts

@@ -1,105 +1,15 @@
-"""Where the cells of a comparison run: in this process, in several on this machine, or on a Ray cluster.
-
-A cell is a pure function of files and seeds and writes its own result, so an engine only has to see to it that
-every cell is run. A cell whose worker dies is run again; other cells do not notice.
-"""
+"""The engine `local`: cells in several processes of this machine."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
 from collections import deque
-from contextlib import contextmanager
 from multiprocessing.connection import Connection, wait
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from nesy.errors import UserError
-from nesy.progress import Task
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from planners.comparison.compare import Cell
-    from planners.config import CompareConfig
-
-CellJob = tuple["Cell", Path, "CompareConfig", int, str]
-"""What `planners.comparison.compare.run_cell` is called with."""
-
-ENGINES = ("local", "ray")
-ATTEMPTS = 8
-"""Times that one cell is begun before its deaths are taken for its own fault."""
-
-
-class Relay:
-    """A progress that hands finished units on, whatever the stage."""
-
-    def __init__(self, advance: Any) -> None:
-        self._advance = advance
-
-    @contextmanager
-    def task(self, description: str, total: int) -> Iterator[Relay]:
-        """A stage; its units count towards the whole grid."""
-        yield self
-
-    def advance(self, steps: int = 1, **metrics: float) -> None:
-        """Report finished episodes."""
-        self._advance(steps)
-
-
-class Tally:
-    """Progress of the grid: a cell that is run again does not count what it had done before a second time."""
-
-    def __init__(self, task: Task) -> None:
-        self.task = task
-        self.counted: dict[str, int] = {}
-
-    def report(self, name: str, done: int) -> None:
-        """The cell has done so many episodes in its present attempt."""
-        new = done - self.counted.get(name, 0)
-        if new > 0:
-            self.counted[name] = done
-            self.task.advance(new)
-
-
-def run_cells(jobs_of: list[CellJob], jobs: int, task: Task, engine: str = "local", address: str | None = None) -> None:
-    """Run every cell.
-
-    Args:
-        jobs_of: the cells.
-        jobs: processes of the engine `local`; with 1, this one.
-        task: told of finished episodes.
-        engine: one of `ENGINES`.
-        address: of the Ray cluster.
-
-    Raises:
-        UserError: an unknown engine, Ray is missing or out of reach, or workers keep dying on one cell.
-    """
-    if engine not in ENGINES:
-        raise UserError(f"unknown engine '{engine}' (known: {', '.join(ENGINES)})")
-    if not jobs_of:
-        return
-    if engine == "ray":
-        from planners.comparison.ray_engine import run_on_ray
-
-        run_on_ray(jobs_of, task, address)
-    elif jobs == 1 or len(jobs_of) == 1:
-        for job in jobs_of:
-            run_job(job, task.advance)
-    else:
-        _run_in_processes(jobs_of, jobs, Tally(task))
-
-
-def run_job(job: CellJob, advance: Any) -> None:
-    """Run one cell here; `advance` is told how many more episodes are done."""
-    from planners.comparison.compare import run_cell
-
-    run_cell(*job, progress=Relay(advance), advance=advance)
-
-
-def give_up(name: str, remedy: str) -> UserError:
-    """The error for a cell that workers keep dying on."""
-    return UserError(f"{name}: its worker died {ATTEMPTS} times (out of memory?); {remedy}")
+from planners.comparison.engines.jobs import ATTEMPTS, CellJob, Tally, give_up, run_job
 
 
 class _Worker:
@@ -117,7 +27,8 @@ class _Worker:
         self.pipe.send(job)
 
 
-def _run_in_processes(jobs_of: list[CellJob], jobs: int, tally: Tally) -> None:
+def run_in_processes(jobs_of: list[CellJob], jobs: int, tally: Tally) -> None:
+    """Run every cell, at most `jobs` at a time; a cell whose process dies is run again."""
     context = multiprocessing.get_context("spawn")
     waiting, attempts = deque(jobs_of), dict.fromkeys((job[0].name for job in jobs_of), 0)
     workers: list[_Worker] = []

@@ -26,10 +26,11 @@ from nesy.errors import UserError
 from nesy.progress import SILENT, Progress
 from nesy.run_folder import RunFolder, atomic_path, read_json
 from planners.agents import Agent, BeliefAgent
-from planners.comparison.compare import EVALUATION_SEED, Cell, grid
 from planners.comparison.evaluation import evaluation_maps
+from planners.comparison.grid import EVALUATION_SEED, Cell, cell_path, grid
+from planners.comparison.model_store import ModelStore
 from planners.comparison.players import cell_seed, restored_player
-from planners.comparison.replay_choice import MOST_EPISODES, Chosen, all_reasons, choose
+from planners.comparison.replay.choice import MOST_EPISODES, Chosen, all_reasons, choose
 from planners.config import CompareConfig
 from planners.perception import Perception, Percepts
 from planners.search.tree import Tree
@@ -107,7 +108,7 @@ def load_replays(path: Path) -> dict[str, Any]:
 
 
 def _evaluated(run: RunFolder, cell: Cell) -> dict[str, list[Any]]:
-    path = _path(run, cell)
+    path = cell_path(run, cell)
     try:
         table = pq.read_table(path, columns=["phase", "episode", "return", "outcome", "map_id"])
     except (OSError, pa.ArrowException) as error:
@@ -118,13 +119,9 @@ def _evaluated(run: RunFolder, cell: Cell) -> dict[str, list[Any]]:
     return {name: rows[name].to_pylist() for name in ("return", "outcome", "map_id")}
 
 
-def _path(run: RunFolder, cell: Cell) -> Path:
-    return run.results / "cells" / f"{cell.name}.parquet"
-
-
 def _fingerprint(run: RunFolder, cells: Sequence[Cell]) -> str:
     """Changes whenever a cell has been run anew with other settings."""
-    marks = [[cell.name, (pq.read_schema(_path(run, cell)).metadata or {}).get(b"fingerprint", b"").decode()]
+    marks = [[cell.name, (pq.read_schema(cell_path(run, cell)).metadata or {}).get(b"fingerprint", b"").decode()]
              for cell in cells]  # fmt: skip
     return hashlib.sha256(json.dumps([VERSION, MOST_EPISODES, marks]).encode()).hexdigest()
 
@@ -206,10 +203,7 @@ def _record(
 
 def _onlooker(run: RunFolder, seed: int) -> Perception:
     """What an agent without perception would have believed, for pictures."""
-    from nesy.world_model import SymbolicCodec, load_world_model
-
-    codec = SymbolicCodec(load_world_model(run.world_model))
-    return Perception(codec, "perspective-shift", np.random.default_rng(seed))
+    return Perception(ModelStore(run).codec, "perspective-shift", np.random.default_rng(seed))
 
 
 def _shield(config: CompareConfig, perception: Perception, domain: Domain) -> Any:

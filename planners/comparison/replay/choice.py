@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from planners.comparison.compare import Cell
+from planners.comparison.grid import Cell
 
 MOST_EPISODES = 60
 REASONS = ("first success", "first failure", "worst regret")

@@ -16,7 +16,7 @@ from typing import Any
 from nesy.errors import UserError
 from nesy.progress import Task
 from nesy.run_folder import RunFolder, atomic_path
-from planners.comparison.engines import ATTEMPTS, CellJob, Tally, give_up, run_job
+from planners.comparison.engines.jobs import ATTEMPTS, CellJob, Tally, give_up, run_job
 
 Files = dict[str, bytes]
 """Contents by path relative to the run folder."""

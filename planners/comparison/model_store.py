@@ -1,0 +1,167 @@
+"""The learned models of a run, in one place: world model, 2DBN, and the local models that planners learn per variant.
+
+Local models lie in ialm/, those of further variants in folders of their own in there; the experience of following
+that they are learned from besides the run's own lies in `practice/` beside them.
+"""
+
+from __future__ import annotations
+
+import shutil
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from domains.core import Domain
+from nesy.errors import UserError
+from nesy.progress import SILENT, Progress
+from nesy.run_folder import RunFolder, read_json
+from planners.config import SearchConfig
+
+if TYPE_CHECKING:
+    from nesy.dbn import TwoSliceDBN
+    from nesy.log.experience import Experience
+    from nesy.world_model import SymbolicCodec
+    from planners.person_following.ialm import IALM
+    from planners.person_following.structured.drawn_maps.mapped_model import MappedModel
+    from planners.person_following.structured.known_maps.minds import MindModel
+
+TABLES_VERSION = 2
+"""Of the local model (planners.person_following.ialm_learning)."""
+MINDS_VERSION = 2
+"""Of the structured model of known maps (planners.person_following.structured.known_maps)."""
+MAPPED_VERSION = 2
+"""Of the structured model of drawn maps (planners.person_following.structured.drawn_maps)."""
+STRUCTURED_FILES = ("minds.json", "minds.npz", "mapped.json", "mapped.npz")
+
+
+class ModelStore:
+    """Reads the learned models of a run, and learns those that planners need."""
+
+    def __init__(self, run: RunFolder) -> None:
+        self.run = run
+
+    @cached_property
+    def codec(self) -> SymbolicCodec:
+        """What turns views into codes, by the run's world model."""
+        from nesy.world_model import SymbolicCodec, load_world_model
+
+        return SymbolicCodec(load_world_model(self.run.world_model))
+
+    @cached_property
+    def dbn(self) -> TwoSliceDBN:
+        """The extracted 2DBN."""
+        from nesy.dbn import TwoSliceDBN
+
+        return TwoSliceDBN.load(self.run.dbn)
+
+    def folder(self, variant: str) -> Path:
+        """Where the local models of a variant are: ialm/, and for further variants a folder of its own in there."""
+        path = self.run.ialm / "model.json"
+        first = read_json(path).get("provenance", {}).get("variant", variant) if path.is_file() else variant
+        return self.run.ialm if first == variant else self.run.ialm / variant
+
+    def local_model(self, variant: str) -> IALM:
+        """The influence-augmented local model of a variant, over the run's 2DBN."""
+        from planners.person_following.ialm import IALM
+
+        return IALM.load(self.folder(variant), self.dbn)
+
+    def structured_model(self, variant: str) -> MindModel | MappedModel | None:
+        """The hand-structured model of a variant; None where it has none."""
+        from planners.person_following.structured.drawn_maps.mapped_model import MappedModel
+        from planners.person_following.structured.known_maps.minds import MindModel
+
+        folder = self.folder(variant)
+        if (folder / "minds.json").is_file():
+            return MindModel.load(folder)
+        return MappedModel.load(folder) if (folder / "mapped.json").is_file() else None
+
+    def practice_steps(self, variant: str, config: SearchConfig) -> int:
+        """Environment steps of the practice that the local models of a variant were learned from."""
+        import pyarrow.parquet as pq
+
+        shards = (self.folder(variant) / "practice").glob("part-*.parquet")
+        rows = sum(pq.read_metadata(path).num_rows for path in shards)
+        return min(rows, config.practice_steps or rows)
+
+    def learn(self, domain: Domain, variant: str, config: SearchConfig, seed: int, progress: Progress = SILENT) -> None:
+        """Learn the local models of a variant from the run's experience and practice, unless the run holds them.
+
+        Raises:
+            UserError: the practice has fewer steps than are to be learned from.
+        """
+        collected = {
+            "variant": variant,
+            "seed": seed,
+            "practice_episodes": config.practice_episodes,
+            "practice_mixture": config.practice_mixture,
+        }
+        provenance = {
+            **collected,
+            "practice_steps": config.practice_steps,
+            "discount": config.discount,
+            "minds": MINDS_VERSION,
+            "tables": TABLES_VERSION,
+            "mapped": MAPPED_VERSION,
+        }
+        home = self.folder(variant)
+        path = home / "model.json"
+        before = read_json(path).get("provenance", {}) if path.is_file() else collected
+        if path.is_file() and before == provenance:
+            return
+        from nesy.log.experience import Experience
+        from planners.person_following.ialm_learning import joined, learn_ialm
+
+        experience = Experience.load(self.run.experience)
+        here = [experience] if self._own_variant() in (None, variant) else []
+        if config.practice_episodes:
+            stale = any(before.get(name) != value for name, value in collected.items())
+            practice = _practice(domain, variant, config, home / "practice", seed, stale, progress)
+            here = [joined(here[0], practice) if here else practice]
+            experience = joined(experience, practice)
+        for name in STRUCTURED_FILES:
+            (home / name).unlink(missing_ok=True)
+        if here:
+            self._learn_structured(here[0], config, provenance, home)
+        model = learn_ialm(self.dbn, self.codec, experience, provenance, config.discount)
+        model.save(home)
+
+    def _learn_structured(
+        self, experience: Experience, config: SearchConfig, provenance: dict[str, Any], home: Path
+    ) -> None:
+        from planners.person_following.structured.drawn_maps.mapped_learning import learn_mapped, walls_hide
+        from planners.person_following.structured.known_maps.mind_learning import learn_minds, several_goals
+
+        if several_goals(experience):
+            learn_minds(self.codec, experience, provenance).save(home)
+        elif walls_hide(experience):
+            learn_mapped(experience, config.mind_discount, provenance).save(home)
+
+    def _own_variant(self) -> str | None:
+        """The variant that the run's own experience is of; None where the run does not say."""
+        return str(read_json(self.run.config)["variant"]) if self.run.config.is_file() else None
+
+
+def _practice(
+    domain: Domain, variant: str, config: SearchConfig, folder: Path, seed: int, stale: bool, progress: Progress
+) -> Experience:
+    """As many steps of following as are to be learned from, episode after episode, collected where they are missing."""
+    from nesy.log.collection import collect_following
+    from nesy.log.experience import Experience
+
+    if stale:
+        shutil.rmtree(folder, ignore_errors=True)
+    collect_following(
+        domain, config.practice_episodes, config.practice_mixture, folder, seed, progress, variant=variant
+    )
+    practice = Experience.load(folder)
+    if not config.practice_steps:
+        return practice
+    if len(practice) < config.practice_steps:
+        raise UserError(
+            f"the practice has {len(practice):,} steps, fewer than the {config.practice_steps:,} to learn from; "
+            "raise --search.practice-episodes, or lower --learning-steps"
+        )
+    return practice.select(np.lexsort((practice.t, practice.episode))[: config.practice_steps])

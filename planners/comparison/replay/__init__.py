@@ -1,0 +1,1 @@
+"""Episodes played again with everything recorded, which ones, and why an agent chose an action."""

@@ -1,0 +1,41 @@
+"""The agents that plan in the influence-augmented local model: particles of it, and a search or QMDP over them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from domains.core import ViewGeometry
+from planners.agents import BeliefAgent, Planner, Situation
+from planners.config import SearchConfig
+from planners.person_following.beliefs import ParticleBelief
+from planners.person_following.ialm import IALM
+from planners.person_following.kernels import compile_model
+
+
+class PlanningAgent(BeliefAgent):
+    """Keeps particles of the local model and plans with pomdp-py's POUCT, QMDP or our own search."""
+
+    def __init__(self, kind: str, model: IALM, config: SearchConfig, geometry: ViewGeometry, seed: int) -> None:
+        super().__init__(geometry, seed)
+        self.kind, self.model, self.config = kind, model, config
+        self.compiled = compile_model(model)
+
+    def _told(self, situation: Situation) -> np.ndarray:
+        assert situation.percepts is not None
+        return situation.percepts.shifted
+
+    def _belief(self, rng: np.random.Generator) -> ParticleBelief:
+        return ParticleBelief(self.model, self.compiled, self.config.particles, rng)
+
+    def _planner(self, rng: np.random.Generator) -> Planner:
+        if self.kind == "pomdp":
+            from planners.person_following.pomdp_py_adapter import POUCTAgent
+
+            return POUCTAgent(self.model, self.compiled, self.config, rng)
+        if self.kind == "qmdp":
+            from planners.person_following.qmdp import LocalQMDP
+
+            return LocalQMDP(self.model, self.compiled, self.config, rng)
+        from planners.person_following.ialm_search import IALMSearch
+
+        return IALMSearch(self.model, self.compiled, self.config, rng)
