@@ -39,7 +39,7 @@ from planners.person_following.ialm_checks import check
 from planners.person_following.motion import RelativeMotion
 
 if TYPE_CHECKING:
-    from nesy.log.experience import Experience
+    pass
 
 TABLES = ("moved", "waits", "influence", "next_waiting", "distance", "next_lost", "visible", "outcome", "reward")
 """The learned tables, in the order in which they are packed for kernels."""
@@ -333,12 +333,3 @@ class IALM:
         except _DAMAGE as error:
             reason = f"{type(error).__name__}: {str(error)[:200]}"
             raise UserError(f"{path}: damaged ({reason}); learn the tables again (nesy compare)") from None
-
-
-def learn(dbn: TwoSliceDBN, codec: Codec, experience: Experience, folder: Path | str) -> IALM:
-    """Learn the model from experience and save it in `folder`."""
-    from planners.person_following.ialm_learning import learn_ialm
-
-    model = learn_ialm(dbn, codec, experience)
-    model.save(Path(folder))
-    return model

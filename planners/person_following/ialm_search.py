@@ -15,11 +15,12 @@ from nesy.errors import UserError
 from planners.config import SearchConfig
 from planners.person_following.ialm import IALM
 from planners.person_following.kernels import Model
+from planners.person_following.local_walk import LocalModel
 from planners.search.drawing import drawing_of
 from planners.search.random_bits import stream
 from planners.search.tree import allocate, clear
 from planners.search.tree_top import in_words
-from planners.search.walk import LocalModel, best_tried, walks
+from planners.search.walk import best_tried, walks
 
 
 class IALMSearch:

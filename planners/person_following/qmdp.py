@@ -17,8 +17,9 @@ from nesy.errors import UserError
 from planners.config import SearchConfig
 from planners.person_following.ialm import IALM
 from planners.person_following.kernels import Model
+from planners.person_following.local_walk import LocalModel
 from planners.search.random_bits import stream
-from planners.search.walk import LocalModel, advance, best_tried, room
+from planners.search.walk import advance, best_tried, room
 
 
 class TabularQMDP:

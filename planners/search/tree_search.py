@@ -29,7 +29,8 @@ from planners.search.bound_search import BeliefTree
 from planners.search.drawing import drawing_of
 from planners.search.random_bits import stream
 from planners.search.tree import allocate, clear, reroot
-from planners.search.walk import PackedPOMDP, TabularBelief, best_tried, walks
+from planners.search.walk import best_tried, walks
+from planners.search.walked_models import PackedPOMDP, TabularBelief
 
 _TOLERANCE = 1e-6
 _START_GAP = 0.01

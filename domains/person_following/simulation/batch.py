@@ -13,7 +13,7 @@ from domains.core import EMPTY, GOAL, DomainError, ViewGeometry
 from domains.person_following.simulation import episodes, people
 from domains.person_following.simulation import rules as kernel
 from domains.person_following.simulation.random_numbers import seeded_stream
-from domains.person_following.simulation.starts import CORNER, Starts
+from domains.person_following.simulation.starts import CORNER, TRIED, Starts
 from domains.person_following.simulation.store import shared_store
 from domains.person_following.simulation.world import (
     BELIEVED_X,
@@ -72,7 +72,7 @@ class Batch:
         self.store = shared_store(size, self.parameters.heading_rule)
         self.world = allocate_world(self.num_envs, self.parameters)
         self.last = allocate_results(self.num_envs, self.parameters.view_size)
-        self.starts = Starts(self.parameters)
+        self.starts = Starts(self.parameters, lambda parameters: Batch("following", TRIED, parameters))
         self._own = np.full(self.num_envs, -1, np.int64)
         self._corner = np.full((self.num_envs, 2), CORNER, np.int64)
         self.seeded = False

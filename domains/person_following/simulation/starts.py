@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,10 +11,9 @@ from numpy.typing import NDArray
 from domains.core import EMPTY
 from domains.person_following.variants import Parameters
 
-if TYPE_CHECKING:
-    from domains.person_following.simulation.batch import Batch
-
 CORNER = (2, 2)
+TRIED = 8
+"""Starts that are tried out side by side."""
 _ROBOT = (1, 1)
 
 
@@ -31,18 +31,27 @@ def candidates(grid: NDArray[np.uint8]) -> list[tuple[int, int]]:
     return sorted(cells, key=lambda cell: (abs(cell[0] - CORNER[0]) + abs(cell[1] - CORNER[1]), *cell))
 
 
+class Trial(Protocol):
+    """Plays the task from given starts: a batch of `TRIED` episodes."""
+
+    def follower_succeeds(self, grid: NDArray[np.uint8], starts: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether a greedy follower succeeds [B] on one map, the person at each of some starts [B, 2]."""
+        ...
+
+
 class Starts:
     """The person's start by map, found once per map and parameters."""
 
-    def __init__(self, parameters: Parameters) -> None:
-        """Find starts under these parameters."""
+    def __init__(self, parameters: Parameters, trial: Callable[[Parameters], Trial]) -> None:
+        """Find starts under these parameters; `trial` makes the batch that tries them out."""
         self.parameters = parameters
         self._known: dict[bytes, tuple[int, int]] = {}
-        self._trial: Batch | None = None
+        self._make_trial = trial
+        self._trial: Trial | None = None
 
     def sharing(self, parameters: Parameters) -> Starts:
         """Starts as they are under other parameters."""
-        return Starts(parameters)
+        return Starts(parameters, self._make_trial)
 
     def of(self, grids: NDArray[np.uint8]) -> NDArray[np.int64]:
         """Starts [B, 2] on maps [B, size, size]."""
@@ -57,13 +66,11 @@ class Starts:
 
     def _first_won(self, grid: NDArray[np.uint8], cells: list[tuple[int, int]]) -> tuple[int, int]:
         """The first cell from which a greedy follower succeeds; the first of all where there is none."""
-        from domains.person_following.simulation.batch import Batch
-
         if self._trial is None:
-            self._trial = Batch("following", 8, self.parameters)
-        for first in range(0, len(cells), 8):
-            some = cells[first : first + 8]
-            won = self._trial.follower_succeeds(grid, np.array(some + [some[-1]] * (8 - len(some)), np.int64))
+            self._trial = self._make_trial(self.parameters)
+        for first in range(0, len(cells), TRIED):
+            some = cells[first : first + TRIED]
+            won = self._trial.follower_succeeds(grid, np.array(some + [some[-1]] * (TRIED - len(some)), np.int64))
             for cell, good in zip(some, won, strict=False):
                 if good:
                     return cell

@@ -34,7 +34,8 @@ def _factored(settings: Settings) -> list[Row]:
     from planners.search.code_sampling import sampler
     from planners.search.random_bits import stream
     from planners.search.tree import allocate, clear
-    from planners.search.walk import FactoredModel, walks
+    from planners.search.walk import walks
+    from planners.search.walked_models import FactoredModel
 
     rng = np.random.default_rng(settings.seed)
     parents = [[tuple(rng.choice(_FACTORS, _PARENTS, replace=False)) for _ in range(_FACTORS)] for _ in range(_ACTIONS)]

@@ -28,7 +28,7 @@ REFERENCES = CompareConfig(agents=("greedy-follower", "random", "greedy-last-see
 def _no_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
     """The exact optimum takes seconds and has tests of its own."""
     monkeypatch.setattr(
-        "planners.comparison.results.map_optimum", lambda *_: {"mean_return": 90.0, "success": 0.8, "maps": []}
+        "planners.comparison.compare.map_optimum", lambda *_: {"mean_return": 90.0, "success": 0.8, "maps": []}
     )
 
 
@@ -120,7 +120,7 @@ def test_every_metric_is_a_column_and_every_table_is_written(tmp_path: Path, mon
     seen = evaluate(domain, "paper", Player(OracleFollower()), 42, EVALUATION_SEED)
     maps = [{"map_id": int(name), "return": 100.0, "success": 1.0} for name in seen["map_id"]]
     monkeypatch.setattr(
-        "planners.comparison.results.map_optimum", lambda *_: {"mean_return": 100.0, "success": 1.0, "maps": maps}
+        "planners.comparison.compare.map_optimum", lambda *_: {"mean_return": 100.0, "success": 1.0, "maps": maps}
     )
     (record,) = compare(run, CompareConfig(agents=("greedy-follower",), episodes=84))
     columns = pq.read_table(run.results / "episodes.parquet").column_names

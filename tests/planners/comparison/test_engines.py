@@ -32,7 +32,7 @@ LEARNERS = CompareConfig(
 
 @pytest.fixture(autouse=True)
 def _no_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("planners.comparison.results.map_optimum", lambda *_: None)
+    monkeypatch.setattr("planners.comparison.compare.map_optimum", lambda *_: None)
 
 
 def rows(run: RunFolder) -> dict[str, list[object]]:

@@ -21,7 +21,7 @@ SLOWER = replace(LEARNERS, dqn=replace(LEARNERS.dqn, episodes=250), seeds=(0, 1)
 
 @pytest.fixture(autouse=True)
 def _no_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("planners.comparison.results.map_optimum", lambda *_: None)
+    monkeypatch.setattr("planners.comparison.compare.map_optimum", lambda *_: None)
 
 
 def soon(holds: Callable[[], bool], seconds: float = 60.0) -> bool:

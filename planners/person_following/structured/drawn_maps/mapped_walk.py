@@ -16,6 +16,7 @@ from planners.person_following.structured.drawn_maps.mapped_ways import (
     moves,
 )
 from planners.search.random_bits import drawn, uniform
+from planners.search.walk import Kernels, register
 
 
 class MappedTree(NamedTuple):
@@ -81,3 +82,6 @@ def mapped_advance(
     after[0], after[1], after[2] = reached, then, tables.next_lost[walk, lost]
     seen = then * ground.follows.shape[0] + person if sight else -1 - then
     return reward, ended, seen, layers.value[reached, then, after[2]]
+
+
+register(MappedTree, Kernels(mapped_room, mapped_begin, mapped_advance))

@@ -10,6 +10,7 @@ from nesy.compiled import njit
 from planners.person_following.motion import STAY
 from planners.person_following.structured.known_maps.ways import PackedWays, feature, moved_chance
 from planners.search.random_bits import drawn, uniform
+from planners.search.walk import Kernels, register
 
 KEYS = 1 << 20
 """Keys that a code's number is multiplied by in an observation: those of the person's pose."""
@@ -91,3 +92,6 @@ def seen_from(ways: PackedWays, node: int, q: int, sight: int) -> int:
         # stations that look alike have their sides alike, so offsets in the frame will do with the heading there
         key = (((dx + 64) * 128 + dy + 64) * 4 + ways.pose[s, q, 2]) * 4 + turned + 1
     return ways.shows[s, q, hidden] * KEYS + key
+
+
+register(MindTree, Kernels(mind_room, mind_begin, mind_advance))
