@@ -43,6 +43,16 @@ class Situation(NamedTuple):
 class Agent(Protocol):
     """Acts in a batch of episodes, from their starts to their ends."""
 
+    @property
+    def algorithm(self) -> str:
+        """What decides, in the field's words."""
+        ...
+
+    @property
+    def model(self) -> str:
+        """What it plans with."""
+        ...
+
     def actions(self, situation: Situation) -> np.ndarray:
         """Actions int64 [B]."""
         ...
@@ -51,8 +61,17 @@ class Agent(Protocol):
 class DQNAgent:
     """Acts greedily on a trained belief DQN."""
 
+    model = "none: learned values of b and b~"
+
     def __init__(self, policy: DQNPolicy) -> None:
         self.policy = policy
+
+    @property
+    def algorithm(self) -> str:
+        """The DQN's extensions by name."""
+        config = self.policy.config
+        used = (("double", config.double), ("dueling", config.dueling), (f"{config.n_step}-step", config.n_step > 1))
+        return " ".join([*(name for name, on in used if on), "DQN"])
 
     def actions(self, situation: Situation) -> np.ndarray:
         """Greedy actions."""
@@ -78,6 +97,9 @@ class BeliefAgent:
 
     Every episode has random streams of its own, so results do not depend on which episodes run side by side.
     """
+
+    algorithm: str
+    model: str
 
     def __init__(self, geometry: ViewGeometry, seed: int) -> None:
         self.geometry, self.seed = geometry, seed

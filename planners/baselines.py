@@ -15,6 +15,9 @@ from planners.agents import Situation
 class RandomAgent:
     """Acts uniformly at random, with a random stream per episode."""
 
+    algorithm = "uniformly random"
+    model = "none"
+
     def __init__(self, num_actions: int, seed: int) -> None:
         self.num_actions, self.seed = num_actions, seed
         self.streams: list[np.random.Generator] = []
@@ -30,16 +33,21 @@ class RandomAgent:
 class OracleFollower:
     """First action of the shortest path to the person's pose on the full map; stays when there."""
 
+    algorithm = "shortest path to the person"
+    model = "the world, full state"
+
     def actions(self, situation: Situation) -> np.ndarray:
         """The expert's actions."""
         return np.asarray(situation.env.expert_actions("follower"), np.int64)
 
 
 class OptimalAgent:
-    """The exact full-state optimum."""
+    """An exact optimum: with the full state, or for a belief from observations."""
 
-    def __init__(self, policy: OraclePolicy) -> None:
-        self.policy = policy
+    algorithm = "dynamic programming"
+
+    def __init__(self, policy: OraclePolicy, model: str) -> None:
+        self.policy, self.model = policy, model
 
     def actions(self, situation: Situation) -> np.ndarray:
         """The oracle's actions."""
@@ -48,6 +56,9 @@ class OptimalAgent:
 
 class LastSeenFollower:
     """Walks to where it last saw the person, by what it sees: the domain's follower, as an agent."""
+
+    algorithm = "shortest path to the last seen pose"
+    model = "none"
 
     def __init__(self, domain: Domain, variant: str) -> None:
         self.domain, self.variant = domain, variant

@@ -14,7 +14,10 @@ from nesy.errors import UserError
 INFLUENCE_MODES = ("zero", "random", "egocentric", "perspective-shift", "perfect-information")
 INPUT_SETS = ("paper", "full")
 LEARNING_AGENTS = ("dqn",)
-PLANNING_AGENTS = ("pomdp", "search", "qmdp")
+TABLE_PLANNERS = ("pomdp", "search", "qmdp")
+"""Plan with the learned local model: the extracted 2DBN and an influence prior through the perspective shift."""
+PLANNING_AGENTS = (*TABLE_PLANNERS, "structured")
+"""`structured` plans with hand-structured models of person following whose parameters are learned."""
 ORACLES = ("optimum", "bayes-optimum", "egocentric-optimum")
 REFERENCE_AGENTS = ("greedy-follower", "greedy-last-seen", "random", *ORACLES)
 AGENTS = LEARNING_AGENTS + PLANNING_AGENTS + REFERENCE_AGENTS
@@ -204,9 +207,10 @@ class SearchConfig:
 class CompareConfig:
     """What is compared: the grid of agents x input sets x influence modes x variants x seeds."""
 
-    agents: tuple[str, ...] = tuple(agent for agent in AGENTS[:-1] if agent != "qmdp")
-    """Which agents: dqn, pomdp (pomdp-py), search, qmdp, greedy-follower, greedy-last-seen, random, and the exact
-    oracles optimum (full state), bayes-optimum and egocentric-optimum (where the task is small enough)."""
+    agents: tuple[str, ...] = tuple(agent for agent in AGENTS[:-1] if agent not in ("qmdp", "structured"))
+    """Which agents: dqn; pomdp (pomdp-py), search and qmdp, which plan with the 2DBN; structured, which plans with
+    hand-structured models (where the task has one); greedy-follower, greedy-last-seen, random; and the exact oracles
+    optimum (full state), bayes-optimum and egocentric-optimum (where the task is small enough)."""
     inputs: tuple[str, ...] = ("full",)
     """Input sets of the DQN: paper (b, b~) or full (b, b~ and the configuration)."""
     influences: tuple[str, ...] = ("random", "perspective-shift", "perfect-information")
@@ -218,7 +222,7 @@ class CompareConfig:
     episodes: int = 168
     """Evaluation episodes per seed, the same maps and seeds for all (`paper`: a multiple of its 42 maps)."""
     planner_episodes: int = 42
-    """Evaluation episodes per seed for the agents that search (`pomdp` and `search`)."""
+    """Evaluation episodes per seed for the agents that plan (`pomdp`, `search`, `qmdp`, `structured`)."""
     confidence: float = 0.95
     """Coverage of the intervals."""
     planner_milliseconds: float = 0.0

@@ -46,7 +46,7 @@ def main() -> None:
     run, domain = RunFolder.open(arguments.run), load_domain()
     config = load(run.config)
     variant = arguments.variant or config.variant
-    ModelStore(run).learn(domain, variant, config.compare.search, config.seed)
+    ModelStore(run).learn(domain, variant, config.compare.search, config.seed, structured=True)
     grids, own, weights = worlds(domain, variant)
     rows: dict[str, dict[str, Any]] = {}
 

@@ -56,8 +56,9 @@ def compare(
     domain = load_domain(domain_name)
     store = ModelStore(run)
     for variant in config.variants:
-        if any(cell.agent in settings.PLANNING_AGENTS for cell in cells):
-            store.learn(domain, variant, config.search_of_cells, seed, progress)
+        planning = {cell.agent for cell in cells if cell.variant == variant} & set(settings.PLANNING_AGENTS)
+        if planning:
+            store.learn(domain, variant, config.search_of_cells, seed, "structured" in planning, progress)
     missing = [cell for cell in cells if result_of(run, config, cell, seed) is None]
     total = sum(_episodes(config, cell) for cell in missing)
     with progress.task("compare", total) as task:

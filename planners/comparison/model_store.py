@@ -1,7 +1,8 @@
 """The learned models of a run, in one place: world model, 2DBN, and the local models that planners learn per variant.
 
 Local models lie in ialm/, those of further variants in folders of their own in there; the experience of following
-that they are learned from besides the run's own lies in `practice/` beside them.
+that they are learned from besides the run's own lies in `practice/` beside them, hand-structured models in
+`structured/`.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from domains.core import Domain
 from nesy.errors import UserError
 from nesy.progress import SILENT, Progress
-from nesy.run_folder import RunFolder, read_json
+from nesy.run_folder import RunFolder, read_json, write_json
 from planners.config import SearchConfig
 
 if TYPE_CHECKING:
@@ -29,11 +30,13 @@ if TYPE_CHECKING:
 
 TABLES_VERSION = 2
 """Of the local model (planners.person_following.ialm_learning)."""
-MINDS_VERSION = 2
-"""Of the structured model of known maps (planners.person_following.structured.known_maps)."""
-MAPPED_VERSION = 2
-"""Of the structured model of drawn maps (planners.person_following.structured.drawn_maps)."""
-STRUCTURED_FILES = ("minds.json", "minds.npz", "mapped.json", "mapped.npz")
+STRUCTURED_VERSION = 3
+"""Of the hand-structured models (planners.person_following.structured)."""
+KNOWN_MAPS, DRAWN_MAPS = "known-maps", "drawn-maps"
+
+
+class NoModel(UserError):
+    """What an agent plans with does not exist for a variant."""
 
 
 class ModelStore:
@@ -68,15 +71,20 @@ class ModelStore:
 
         return IALM.load(self.folder(variant), self.dbn)
 
-    def structured_model(self, variant: str) -> MindModel | MappedModel | None:
-        """The hand-structured model of a variant; None where it has none."""
+    def structured_model(self, variant: str) -> MindModel | MappedModel:
+        """The hand-structured model of a variant.
+
+        Raises:
+            NoModel: the variant is of a kind that none was written for.
+        """
         from planners.person_following.structured.drawn_maps.mapped_model import MappedModel
         from planners.person_following.structured.known_maps.minds import MindModel
 
-        folder = self.folder(variant)
-        if (folder / "minds.json").is_file():
-            return MindModel.load(folder)
-        return MappedModel.load(folder) if (folder / "mapped.json").is_file() else None
+        folder = self.folder(variant) / "structured"
+        kind = read_json(folder / "kind.json")["kind"]
+        if kind is None:
+            raise NoModel("no hand-structured model: one goal per map, and nothing hidden by walls")
+        return MindModel.load(folder) if kind == KNOWN_MAPS else MappedModel.load(folder)
 
     def practice_steps(self, variant: str, config: SearchConfig) -> int:
         """Environment steps of the practice that the local models of a variant were learned from."""
@@ -86,8 +94,24 @@ class ModelStore:
         rows = sum(pq.read_metadata(path).num_rows for path in shards)
         return min(rows, config.practice_steps or rows)
 
-    def learn(self, domain: Domain, variant: str, config: SearchConfig, seed: int, progress: Progress = SILENT) -> None:
+    def learn(
+        self,
+        domain: Domain,
+        variant: str,
+        config: SearchConfig,
+        seed: int,
+        structured: bool = False,
+        progress: Progress = SILENT,
+    ) -> None:
         """Learn the local models of a variant from the run's experience and practice, unless the run holds them.
+
+        Args:
+            domain: plays the practice.
+            variant: of the task.
+            config: how much practice, and the discount.
+            seed: of the practice.
+            structured: learn the hand-structured model too.
+            progress: told of collected episodes.
 
         Raises:
             UserError: the practice has fewer steps than are to be learned from.
@@ -98,18 +122,13 @@ class ModelStore:
             "practice_episodes": config.practice_episodes,
             "practice_mixture": config.practice_mixture,
         }
-        provenance = {
-            **collected,
-            "practice_steps": config.practice_steps,
-            "discount": config.discount,
-            "minds": MINDS_VERSION,
-            "tables": TABLES_VERSION,
-            "mapped": MAPPED_VERSION,
-        }
+        learned_from = {**collected, "practice_steps": config.practice_steps}
+        tables = {**learned_from, "discount": config.discount, "tables": TABLES_VERSION}
+        scenes = {**learned_from, "discount": config.mind_discount, "structured": STRUCTURED_VERSION}
         home = self.folder(variant)
-        path = home / "model.json"
-        before = read_json(path).get("provenance", {}) if path.is_file() else collected
-        if path.is_file() and before == provenance:
+        before = _provenance(home / "model.json")
+        wanted = before != tables, structured and _provenance(home / "structured" / "kind.json") != scenes
+        if not any(wanted):
             return
         from nesy.log.experience import Experience
         from planners.person_following.ialm_learning import joined, learn_ialm
@@ -117,31 +136,37 @@ class ModelStore:
         experience = Experience.load(self.run.experience)
         here = [experience] if self._own_variant() in (None, variant) else []
         if config.practice_episodes:
-            stale = any(before.get(name) != value for name, value in collected.items())
+            stale = before is not None and any(before.get(name) != value for name, value in collected.items())
             practice = _practice(domain, variant, config, home / "practice", seed, stale, progress)
             here = [joined(here[0], practice) if here else practice]
             experience = joined(experience, practice)
-        for name in STRUCTURED_FILES:
-            (home / name).unlink(missing_ok=True)
-        if here:
-            self._learn_structured(here[0], config, provenance, home)
-        model = learn_ialm(self.dbn, self.codec, experience, provenance, config.discount)
-        model.save(home)
+        if wanted[1]:
+            self._learn_structured(here[0] if here else None, scenes, home / "structured")
+        if wanted[0]:
+            learn_ialm(self.dbn, self.codec, experience, tables, config.discount).save(home)
 
-    def _learn_structured(
-        self, experience: Experience, config: SearchConfig, provenance: dict[str, Any], home: Path
-    ) -> None:
+    def _learn_structured(self, experience: Experience | None, provenance: dict[str, Any], folder: Path) -> None:
+        """The model of the kind that the experience asks for; which one that is stands in `kind.json`, written last."""
         from planners.person_following.structured.drawn_maps.mapped_learning import learn_mapped, walls_hide
         from planners.person_following.structured.known_maps.mind_learning import learn_minds, several_goals
 
-        if several_goals(experience):
-            learn_minds(self.codec, experience, provenance).save(home)
-        elif walls_hide(experience):
-            learn_mapped(experience, config.mind_discount, provenance).save(home)
+        kind = None
+        if experience is not None and several_goals(experience):
+            kind = KNOWN_MAPS
+            learn_minds(self.codec, experience, provenance).save(folder)
+        elif experience is not None and walls_hide(experience):
+            kind = DRAWN_MAPS
+            learn_mapped(experience, float(provenance["discount"]), provenance).save(folder)
+        write_json(folder / "kind.json", {"kind": kind, "provenance": provenance})
 
     def _own_variant(self) -> str | None:
         """The variant that the run's own experience is of; None where the run does not say."""
         return str(read_json(self.run.config)["variant"]) if self.run.config.is_file() else None
+
+
+def _provenance(path: Path) -> dict[str, Any] | None:
+    """What a stored model was learned from; None where there is none."""
+    return dict(read_json(path).get("provenance", {})) if path.is_file() else None
 
 
 def _practice(

@@ -142,13 +142,14 @@ def _planner(cell: Cell, store: ModelStore, domain: Domain, config: CompareConfi
         from planners.person_following.influence_rules import constrain_influence
 
         model, _ = constrain_influence(model, [Path(rule) for rule in config.rules], codec, domain)
-    structured = store.structured_model(cell.variant) if cell.agent == "search" else None
-    if structured is None:
+    if cell.agent != "structured":
         return PlanningAgent(cell.agent, model, search, geometry, seed)
-    possible = None if model is plain else _possible(model, plain)
     from planners.person_following.structured.drawn_maps.mapped_agent import MappedAgent
     from planners.person_following.structured.known_maps.mind_agent import MindAgent
     from planners.person_following.structured.known_maps.minds import MindModel
+
+    structured = store.structured_model(cell.variant)
+    possible = None if model is plain else _possible(model, plain)
 
     if isinstance(structured, MindModel):
         agent = MindAgent(structured, codec, cell.influence, search, geometry, seed)
@@ -172,8 +173,9 @@ def _reference(cell: Cell, domain: Domain, seed: int) -> Agent:
     if cell.agent in simple:
         return simple[cell.agent]()
     oracles = {
-        "optimum": domain.optimum,
-        "bayes-optimum": domain.bayes_optimum,
-        "egocentric-optimum": domain.egocentric_optimum,
+        "optimum": (domain.optimum, "the world, full state"),
+        "bayes-optimum": (domain.bayes_optimum, "the world, exact belief"),
+        "egocentric-optimum": (domain.egocentric_optimum, "the world, persons taken to know what the robot knows"),
     }
-    return OptimalAgent(oracles[cell.agent](cell.variant).policy)
+    solve, model = oracles[cell.agent]
+    return OptimalAgent(solve(cell.variant).policy, model)

@@ -22,14 +22,15 @@ from nesy.errors import UserError
 from nesy.progress import SILENT, Progress
 from nesy.run_folder import RunFolder, atomic_path
 from planners import config as settings
+from planners.agents import Agent
 from planners.comparison.evaluation import Columns, evaluate, outcome_names
 from planners.comparison.grid import EVALUATION_SEED, Cell, cell_path, episodes_evaluated
-from planners.comparison.model_store import MAPPED_VERSION, MINDS_VERSION, TABLES_VERSION
+from planners.comparison.model_store import STRUCTURED_VERSION, TABLES_VERSION, NoModel
 from planners.comparison.players import build_player
 from planners.config import CompareConfig
 
 OUT_OF_REACH = b"out of reach"
-"""Key of a cell's metadata: why an exact oracle cannot be had on its variant."""
+"""Key of a cell's metadata: why an exact oracle, or what the agent plans with, cannot be had on its variant."""
 
 
 def run_cell(
@@ -43,7 +44,8 @@ def run_cell(
 ) -> None:
     """Run one cell and write its episodes (and the trained policy, if it learns).
 
-    An exact oracle that is out of reach on its variant leaves no episodes, and the reason.
+    An exact oracle that is out of reach on its variant leaves no episodes, and the reason; so does an agent whose model
+    does not exist there.
     """
     run, domain = RunFolder(folder), load_domain(domain_name)
     fingerprint = _fingerprint(config, cell, seed)
@@ -51,16 +53,18 @@ def run_cell(
     episodes = episodes_evaluated(config, cell)
     try:
         built = build_player(cell, run, domain, config, seed, progress, checkpoint)
-    except DomainError as error:
-        if cell.agent not in settings.ORACLES:
+    except (DomainError, NoModel) as error:
+        if isinstance(error, DomainError) and cell.agent not in settings.ORACLES:
             raise
         nothing = {"return": np.zeros(0), "length": np.zeros(0, np.int64), "outcome": np.zeros(0, np.int64)}
-        _write(run, cell, _table(cell, "eval", nothing), {"fingerprint": fingerprint, OUT_OF_REACH: str(error)})
+        empty = _table(cell, "eval", nothing, None)
+        _write(run, cell, empty, {"fingerprint": fingerprint, OUT_OF_REACH: str(error)})
         return advance(episodes)
     results = evaluate(domain, cell.variant, built.player, episodes, EVALUATION_SEED + cell.seed, advance)
     results["experience_steps"] = np.full(episodes, built.experience_steps)
-    tables = [_table(cell, "train", built.training)] if built.training is not None else []
-    table = pa.concat_tables([*tables, _table(cell, "eval", results)], promote_options="default")
+    tables = [_table(cell, "train", built.training, built.player.agent)] if built.training is not None else []
+    evaluated = _table(cell, "eval", results, built.player.agent)
+    table = pa.concat_tables([*tables, evaluated], promote_options="default")
     _write(run, cell, table, {"fingerprint": fingerprint})
     checkpoint.unlink(missing_ok=True)
 
@@ -91,7 +95,7 @@ def _fingerprint(config: CompareConfig, cell: Cell, seed: int) -> str:
         relevant["dqn"] = asdict(replace(config.dqn_of_cells, checkpoint_seconds=0.0))
     if cell.agent in settings.PLANNING_AGENTS:
         relevant["search"] = asdict(config.search_of_cells)
-        relevant["learned"] = TABLES_VERSION, MINDS_VERSION, MAPPED_VERSION
+        relevant["learned"] = STRUCTURED_VERSION if cell.agent == "structured" else TABLES_VERSION
     try:
         files = [*config.rules, *([cell.policy] if cell.policy else [])]
         relevant["files"] = [hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in files]
@@ -100,7 +104,7 @@ def _fingerprint(config: CompareConfig, cell: Cell, seed: int) -> str:
     return hashlib.sha256(json.dumps(relevant, sort_keys=True).encode()).hexdigest()
 
 
-def _table(cell: Cell, phase: str, columns: Columns) -> pa.Table:
+def _table(cell: Cell, phase: str, columns: Columns, agent: Agent | None) -> pa.Table:
     """The rows of results/episodes.parquet; measures that a phase lacks are null."""
     count = len(columns["return"])
     values: dict[str, pa.Array] = {
@@ -110,6 +114,8 @@ def _table(cell: Cell, phase: str, columns: Columns) -> pa.Table:
             ("inputs", cell.inputs),
             ("influence", cell.influence),
             ("variant", cell.variant),
+            ("algorithm", "" if agent is None else agent.algorithm),
+            ("model", "" if agent is None else agent.model),
         )
     }
     values["seed"] = pa.array(np.full(count, cell.seed), pa.int64())

@@ -11,13 +11,18 @@ from planners.person_following.beliefs import ParticleBelief
 from planners.person_following.ialm import IALM
 from planners.person_following.kernels import compile_model
 
+ALGORITHMS = {"pomdp": "POUCT of pomdp-py", "search": "PO-UCT", "qmdp": "QMDP"}
+
 
 class PlanningAgent(BeliefAgent):
     """Keeps particles of the local model and plans with pomdp-py's POUCT, QMDP or our own search."""
 
+    model = "2DBN and influence prior (learned local model)"
+
     def __init__(self, kind: str, model: IALM, config: SearchConfig, geometry: ViewGeometry, seed: int) -> None:
         super().__init__(geometry, seed)
-        self.kind, self.model, self.config = kind, model, config
+        self.kind, self.local_model, self.config = kind, model, config
+        self.algorithm = ALGORITHMS[kind]
         self.compiled = compile_model(model)
 
     def _told(self, situation: Situation) -> np.ndarray:
@@ -25,17 +30,17 @@ class PlanningAgent(BeliefAgent):
         return situation.percepts.shifted
 
     def _belief(self, rng: np.random.Generator) -> ParticleBelief:
-        return ParticleBelief(self.model, self.compiled, self.config.particles, rng)
+        return ParticleBelief(self.local_model, self.compiled, self.config.particles, rng)
 
     def _planner(self, rng: np.random.Generator) -> Planner:
         if self.kind == "pomdp":
             from planners.person_following.pomdp_py_adapter import POUCTAgent
 
-            return POUCTAgent(self.model, self.compiled, self.config, rng)
+            return POUCTAgent(self.local_model, self.compiled, self.config, rng)
         if self.kind == "qmdp":
             from planners.person_following.qmdp import LocalQMDP
 
-            return LocalQMDP(self.model, self.compiled, self.config, rng)
+            return LocalQMDP(self.local_model, self.compiled, self.config, rng)
         from planners.person_following.ialm_search import IALMSearch
 
-        return IALMSearch(self.model, self.compiled, self.config, rng)
+        return IALMSearch(self.local_model, self.compiled, self.config, rng)

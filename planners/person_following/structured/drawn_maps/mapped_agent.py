@@ -97,6 +97,9 @@ class MappedSearch:
 class MappedAgent(BeliefAgent):
     """Draws a map, keeps an exact belief over where the person is on it, and searches in it."""
 
+    algorithm = "one-step expectation by sampling, leaves by imagined trajectories"
+    model = "hand-structured: a map drawn on the way; learned tables"
+
     def __init__(
         self,
         model: MappedModel,
@@ -108,7 +111,7 @@ class MappedAgent(BeliefAgent):
         possible: Callable[[np.ndarray], np.ndarray] | None = None,
     ) -> None:
         super().__init__(geometry, seed)
-        self.model, self.codec, self.influence, self.config, self.possible = model, codec, influence, config, possible
+        self.drawn_map, self.codec, self.influence, self.config, self.possible = model, codec, influence, config, possible
         self.tables = tables_of(model, influence == "perfect-information")
 
     def _seen(self, situation: Situation) -> np.ndarray:
@@ -120,7 +123,7 @@ class MappedAgent(BeliefAgent):
         return situation.env.person_views()
 
     def _belief(self, rng: np.random.Generator) -> MappedBelief:
-        return MappedBelief(self.model, self.tables, self.codec, self.influence, rng, self.possible)
+        return MappedBelief(self.drawn_map, self.tables, self.codec, self.influence, rng, self.possible)
 
     def _planner(self, rng: np.random.Generator) -> MappedSearch:
-        return MappedSearch(self.model, self.config, rng)
+        return MappedSearch(self.drawn_map, self.config, rng)
