@@ -111,7 +111,8 @@ class MappedAgent(BeliefAgent):
         possible: Callable[[np.ndarray], np.ndarray] | None = None,
     ) -> None:
         super().__init__(geometry, seed)
-        self.drawn_map, self.codec, self.influence, self.config, self.possible = model, codec, influence, config, possible
+        self.drawn_map, self.codec, self.config = model, codec, config
+        self.influence, self.possible = influence, possible
         self.tables = tables_of(model, influence == "perfect-information")
 
     def _seen(self, situation: Situation) -> np.ndarray:
