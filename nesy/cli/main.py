@@ -66,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(name: str, arguments: list[str]) -> int:
-    # numba and torch stay single-threaded per process: one process per core is faster here (DESIGN, section 6).
+    # numba and torch stay single-threaded per process: one process per core is faster here.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     from domains.core import DomainError
     from nesy.errors import UserError
