@@ -63,11 +63,6 @@ class ViewGeometry:
         return self.view_size // 2, self.view_size - 1
 
     @property
-    def viewer_heading(self) -> int:
-        """The viewer's heading in view coordinates."""
-        return 3
-
-    @property
     def num_configurations(self) -> int:
         """Number of values a configuration can take, `unseen` included."""
         return 1 + self.view_size**2 * 4

@@ -1,7 +1,7 @@
-"""Behaviours that need no learning: random, A* expert, switching mixture, and two greedy followers.
+"""Behaviours that need no learning.
 
 The greedy follower with the full state is `env.expert_actions("follower")`; the A* expert of the crossing task
-is `env.expert_actions("goal")`. Here are those with a memory or a mixture.
+is `env.expert_actions("goal")`. Here is the one with a memory.
 """
 
 from __future__ import annotations
@@ -17,20 +17,6 @@ from domains.person_following.simulation.paths import allocate_scratch, find_pat
 from domains.person_following.variants import Parameters
 
 _REACH = 10  # cells around the robot that its path search considers
-
-
-class SwitchingMixture:
-    """Random and expert play in turns: each environment switches between them with some probability."""
-
-    def __init__(self, num_envs: int, switch: float, rng: np.random.Generator) -> None:
-        """Begin with a random choice for each environment."""
-        self.switch, self.rng = switch, rng
-        self._random = rng.random(num_envs) < 0.5
-
-    def actions(self, expert: NDArray[np.int64]) -> NDArray[np.int64]:
-        """`[B]`: the expert's actions, or random ones."""
-        self._random ^= self.rng.random(len(expert)) < self.switch
-        return np.where(self._random, self.rng.integers(0, 4, len(expert)), expert)
 
 
 class LastSeenFollower:

@@ -6,7 +6,7 @@ import dataclasses
 import types
 import typing
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -150,8 +150,3 @@ def differences(old: Any, new: Any, prefix: str = "") -> list[str]:
         elif before != after:
             found.append(f"{prefix}{item.name}: {before}, now {after}")
     return found
-
-
-def with_sections(config: RunConfig, **sections: Any) -> RunConfig:
-    """`config` with the given sections replaced."""
-    return replace(config, **sections)

@@ -1,6 +1,6 @@
 """The symbolic two-slice dynamic Bayesian network: data, inference, extraction, files.
 
-Names are handed on lazily, so that reading a table never imports numba or scikit-learn.
+Names are handed on lazily, so that reading a table never imports numba.
 """
 
 from __future__ import annotations

@@ -11,10 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from domains.core import EMPTY, UNSEEN, WALL
+from domains.core import EMPTY, LEFT, RIGHT, UNSEEN, WALL
 from nesy.compiled import njit
 
-LEFT, RIGHT, FORWARD = 0, 1, 2
 UP = 3
 """The viewer's own heading in view coordinates."""
 

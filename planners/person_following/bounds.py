@@ -14,9 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from planners.models.tables import DecisionTable
-from planners.person_following.motion import NUM_HEADINGS, NUM_MOTIONS, NUM_MOVES, RelativeMotion
-
-WAIT = 3
+from planners.person_following.motion import NUM_HEADINGS, NUM_MOTIONS, NUM_MOVES, WAIT, RelativeMotion
 
 
 def relational_values(

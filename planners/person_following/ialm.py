@@ -26,7 +26,7 @@ import zlib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -37,9 +37,6 @@ from nesy.run_folder import atomic_path, read_json, write_json
 from planners.models.tables import DecisionTable, PackedTables, pack
 from planners.person_following.ialm_checks import check
 from planners.person_following.motion import RelativeMotion
-
-if TYPE_CHECKING:
-    pass
 
 TABLES = ("moved", "waits", "influence", "next_waiting", "distance", "next_lost", "visible", "outcome", "reward")
 """The learned tables, in the order in which they are packed for kernels."""
@@ -88,8 +85,6 @@ SCALARS = (
 ) = range(len(SCALARS))
 STATE_SCALARS = 5
 """What a state holds besides the two codes: side, ahead, heading, waiting, lost."""
-FORWARD, STAY = 2, 3
-WAIT = 3
 MAX_DISTANCE = 15
 """Distances from here on count as one."""
 TIMEOUT = 5

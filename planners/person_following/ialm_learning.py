@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from domains.core import FORWARD, STAY
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
 from planners.models.split_tables import learn_by
 from planners.models.tables import DecisionTable, Parents, learn_distribution, learn_mean
 from planners.person_following import ialm
 from planners.person_following.bounds import relational_values
-from planners.person_following.ialm import FORWARD, IALM, MAX_DISTANCE, SCALARS, STAY, TIMEOUT, WAIT, Codec
-from planners.person_following.motion import RelativeMotion, learn_motion
+from planners.person_following.ialm import IALM, MAX_DISTANCE, SCALARS, TIMEOUT, Codec
+from planners.person_following.motion import WAIT, RelativeMotion, learn_motion
 
 if TYPE_CHECKING:
     from nesy.log.experience import Experience

@@ -10,15 +10,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from domains.core import FORWARD, STAY
 from nesy.compiled import njit
 from nesy.dbn.inference.kernels import Packed
 from planners.models.tables import PackedTables, locate
 from planners.person_following import ialm
 from planners.person_following.ialm import IALM
+from planners.person_following.motion import WAIT
 from planners.search.code_sampling import CodeSampler, next_code, sampler
 from planners.search.random_bits import uniform
 
-FORWARD, STAY, WAIT = ialm.FORWARD, ialm.STAY, ialm.WAIT
 _FLOOR = 1e-6  # a transition that the 2DBN calls impossible is only very improbable: the model is learned
 
 

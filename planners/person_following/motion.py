@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from domains.core import FORWARD, STAY
+
 if TYPE_CHECKING:
     from nesy.log.experience import Experience
 
 NUM_MOTIONS, NUM_MOVES, NUM_HEADINGS = 4, 4, 4
-FORWARD, STAY = 2, 3
 WAIT = 3
+"""The person's action when it does not move; its others are left, right, forward."""
 
 
 @dataclass(frozen=True)

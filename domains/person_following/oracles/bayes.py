@@ -17,8 +17,8 @@ import numpy as np
 
 from domains.core import DomainError
 from domains.person_following.oracles.beliefs import KEPT_STEPS, Belief, Gains, Successor, Worlds
+from domains.person_following.simulation.batch import NUM_ACTIONS
 
-NUM_ACTIONS = 4
 _LEAST = -60.0
 
 

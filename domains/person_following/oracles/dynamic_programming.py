@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from domains.core import FORWARD, STAY
 from domains.person_following.oracles.person_chain import PersonChain
+from domains.person_following.simulation.batch import NUM_ACTIONS
 from domains.person_following.simulation.compiled import entry, inner
 from domains.person_following.simulation.paths import STEPS
 from domains.person_following.variants import (
@@ -27,8 +28,6 @@ from domains.person_following.variants import (
     R_ROBOT_REST,
     Parameters,
 )
-
-NUM_ACTIONS = 4
 
 
 class StepTables(NamedTuple):

@@ -12,7 +12,6 @@ import numpy as np
 
 from nesy.dbn.codebook import Codebook
 from nesy.dbn.model import TwoSliceDBN
-from nesy.errors import UserError
 from nesy.perspective.operator import TableModel, shift
 
 FLOOR = 0.02
@@ -57,14 +56,3 @@ def persons_worlds(
     chances[chances < 1e-3] = 0.0
     drawn = np.random.default_rng(seed).choice(len(known), size=particles, p=chances / chances.sum())
     return PersonsWorlds(known[drawn], bool(shifted.reachable[0]))
-
-
-def code_of(codebook: Codebook, view: int) -> np.ndarray:
-    """The code of a view given by its number.
-
-    Raises:
-        UserError: there is no such view.
-    """
-    if not 0 <= view < len(codebook):
-        raise UserError(f"no view {view}; the model's views are 0 to {len(codebook) - 1}")
-    return codebook.codes[view]

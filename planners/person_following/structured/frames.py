@@ -10,13 +10,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from domains.core import LEFT, RIGHT
+from domains.core import FORWARD, LEFT, RIGHT, STAY
 from nesy.errors import UserError
-from planners.person_following.motion import FORWARD, NUM_HEADINGS, NUM_MOTIONS, NUM_MOVES, STAY
+from planners.person_following.motion import NUM_HEADINGS, NUM_MOTIONS, NUM_MOVES
 
 if TYPE_CHECKING:
     from nesy.log.experience import Experience
 
+FAR = 255
+"""Length of a walk that does not exist, or is longer than was asked for."""
 AHEAD = 3
 """The heading of whoever looks as the robot does."""
 

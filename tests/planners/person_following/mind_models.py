@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from domains.core import load_domain
+from domains.core import FORWARD, STAY, load_domain
 from nesy.config import CollectConfig
 from nesy.log.collection import collect, collect_following
 from nesy.log.experience import Experience
 from planners.person_following.ialm_learning import joined
-from planners.person_following.motion import FORWARD, STAY
 from planners.person_following.structured.known_maps.minds import MAX_WALK, MindModel
 from planners.person_following.structured.known_maps.ways import Node, Ways
 

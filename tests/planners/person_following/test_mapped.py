@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from domains.core import GOAL, UNSEEN, WALL, load_domain
+from domains.core import FORWARD, GOAL, STAY, UNSEEN, WALL, load_domain
 from nesy.errors import UserError
 from nesy.log.collection import collect_following
 from nesy.log.experience import Experience
 from planners.agents import Situation
 from planners.config import SearchConfig
 from planners.perception import Percepts
-from planners.person_following.motion import FORWARD, NUM_MOVES, STAY
+from planners.person_following.motion import NUM_MOVES
 from planners.person_following.structured.drawn_maps.mapped_agent import MappedAgent
 from planners.person_following.structured.drawn_maps.mapped_belief import MappedBelief, views_from
 from planners.person_following.structured.drawn_maps.mapped_learning import learn_mapped, walls_hide

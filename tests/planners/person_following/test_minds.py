@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from domains.core import GOAL, UNSEEN, WALL, load_domain
+from domains.core import FORWARD, GOAL, STAY, UNSEEN, WALL, load_domain
 from nesy.errors import UserError
 from nesy.log.experience import Experience
 from planners.config import SearchConfig
-from planners.person_following.motion import FORWARD, STAY
 from planners.person_following.structured.frames import learn_frame
 from planners.person_following.structured.known_maps.mind_agent import MindSearch
 from planners.person_following.structured.known_maps.mind_beliefs import MindBelief

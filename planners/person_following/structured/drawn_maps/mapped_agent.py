@@ -15,6 +15,7 @@ from domains.core import ViewGeometry
 from planners.agents import BeliefAgent, Situation
 from planners.config import SearchConfig
 from planners.perception import Codec
+from planners.person_following.motion import NUM_MOTIONS
 from planners.person_following.structured.drawn_maps.mapped_belief import MappedBelief
 from planners.person_following.structured.drawn_maps.mapped_model import MappedModel
 from planners.person_following.structured.drawn_maps.mapped_walk import MappedParticles, MappedTree
@@ -24,7 +25,6 @@ from planners.search.tree import allocate, clear
 from planners.search.tree_top import in_words
 from planners.search.walk import best_tried, walks
 
-NUM_ACTIONS = 4
 HORIZON = 14
 """For how many steps persons' ways are imagined."""
 DEPTH = 1
@@ -43,7 +43,7 @@ class MappedSearch:
     def __init__(self, model: MappedModel, config: SearchConfig, rng: np.random.Generator) -> None:
         self.model, self.config = model, config
         self.tables = tables_of(model)
-        self.tree = allocate(config.simulations + 2, NUM_ACTIONS)
+        self.tree = allocate(config.simulations + 2, NUM_MOTIONS)
         self._bits = stream(rng)
 
     def plan(
@@ -51,7 +51,7 @@ class MappedSearch:
     ) -> tuple[int, dict[str, Any]]:
         """The best action among those `allowed`, bool [A], and what the search saw; `spent` as of `IALMSearch`."""
         begun = time.perf_counter()
-        mask = np.ones(NUM_ACTIONS, np.bool_) if allowed is None else np.asarray(allowed, np.bool_)
+        mask = np.ones(NUM_MOTIONS, np.bool_) if allowed is None else np.asarray(allowed, np.bool_)
         clear(self.tree)
         config = self.config
         people, lost = np.nonzero(belief.weights)

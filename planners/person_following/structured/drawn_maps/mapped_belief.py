@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from domains.core import EMPTY, UNSEEN, WALL
+from domains.core import EMPTY, STAY, UNSEEN, WALL
 from nesy.compiled import njit
-from planners.person_following.motion import NUM_HEADINGS, NUM_MOVES, STAY
+from planners.person_following.motion import NUM_HEADINGS, NUM_MOVES
 from planners.person_following.structured.drawn_maps.mapped_model import AROUND, MAX_WALK, MappedModel
 from planners.person_following.structured.drawn_maps.mapped_ways import (
     Ground,

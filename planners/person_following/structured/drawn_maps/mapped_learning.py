@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from domains.core import UNSEEN, WALL
+from domains.core import FORWARD, STAY, UNSEEN, WALL
 from nesy.compiled import njit
 from nesy.errors import UserError
 from planners.models.tables import DecisionTable, Parents, learn_distribution, learn_mean
 from planners.person_following.ialm import TIMEOUT
-from planners.person_following.motion import FORWARD, NUM_HEADINGS, NUM_MOVES, STAY
+from planners.person_following.motion import NUM_HEADINGS, NUM_MOVES
 from planners.person_following.structured.drawn_maps.mapped_model import (
     AROUND,
     BACK,

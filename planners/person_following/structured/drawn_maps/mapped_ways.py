@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from domains.core import GOAL, WALL
+from domains.core import FORWARD, GOAL, STAY, WALL
 from nesy.compiled import njit
 from planners.models.tables import PackedTables, locate
-from planners.person_following.motion import FORWARD, NUM_HEADINGS, NUM_MOVES, STAY
+from planners.person_following.motion import NUM_HEADINGS, NUM_MOVES
 from planners.person_following.structured.drawn_maps.mapped_model import (
     AROUND,
     BACK,
@@ -26,7 +26,8 @@ from planners.person_following.structured.drawn_maps.mapped_model import (
     REACH,
     MappedModel,
 )
-from planners.person_following.structured.drawn_maps.mapping import FAR, Chart, patch, walks_to, ways_on
+from planners.person_following.structured.drawn_maps.mapping import Chart, patch, walks_to, ways_on
+from planners.person_following.structured.frames import FAR
 
 _LEAST = 0.01
 _RARE = 0.02

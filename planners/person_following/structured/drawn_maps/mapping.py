@@ -14,13 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from domains.core import EMPTY, GOAL, UNSEEN, WALL
+from domains.core import EMPTY, FORWARD, GOAL, UNSEEN, WALL
 from nesy.compiled import njit
-from planners.person_following.motion import FORWARD, NUM_HEADINGS, NUM_MOTIONS
-from planners.person_following.structured.frames import AHEAD, Frame
-
-FAR = 255
-"""Length of a walk that does not exist, or is longer than was asked for."""
+from planners.person_following.motion import NUM_HEADINGS, NUM_MOTIONS
+from planners.person_following.structured.frames import AHEAD, FAR, Frame
 
 
 class Chart(NamedTuple):

@@ -18,7 +18,8 @@ import numpy as np
 from domains.core import GOAL, UNSEEN
 from planners.models.tables import DecisionTable, Parents, learn_distribution
 from planners.person_following.motion import NUM_MOVES
-from planners.person_following.structured.known_maps.scenes import FAR, Scenes
+from planners.person_following.structured.frames import FAR
+from planners.person_following.structured.known_maps.scenes import Scenes
 
 if TYPE_CHECKING:
     from nesy.log.experience import Experience

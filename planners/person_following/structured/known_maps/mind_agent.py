@@ -14,6 +14,7 @@ from domains.core import ViewGeometry
 from planners.agents import BeliefAgent, Situation
 from planners.config import SearchConfig
 from planners.perception import Codec
+from planners.person_following.motion import NUM_MOTIONS
 from planners.person_following.structured.known_maps.mind_beliefs import MindBelief, Truth
 from planners.person_following.structured.known_maps.mind_walk import KEYS, MindParticles, MindTree
 from planners.person_following.structured.known_maps.minds import MindModel
@@ -23,7 +24,6 @@ from planners.search.tree import allocate, clear
 from planners.search.tree_top import in_words
 from planners.search.walk import best_tried, walks
 
-NUM_ACTIONS = 4
 SLACK = 0.01
 """How improbable it is, per step, that a person taken to know everything does not know of a moved goal yet."""
 
@@ -39,14 +39,14 @@ class MindSearch:
 
     def __init__(self, ways: Ways, config: SearchConfig, rng: np.random.Generator) -> None:
         self.ways, self.config = ways, config
-        self.tree = allocate(config.simulations + 2, NUM_ACTIONS)
+        self.tree = allocate(config.simulations + 2, NUM_MOTIONS)
         self._bits = stream(rng)
 
     def plan(
         self, belief: MindParticles, allowed: np.ndarray | None = None, spent: float = 0.0
     ) -> tuple[int, dict[str, Any]]:
         """The best action among those `allowed`, bool [A], and what the search saw; `spent` as of `IALMSearch`."""
-        mask = np.ones(NUM_ACTIONS, np.bool_) if allowed is None else np.asarray(allowed, np.bool_)
+        mask = np.ones(NUM_MOTIONS, np.bool_) if allowed is None else np.asarray(allowed, np.bool_)
         clear(self.tree)
         config = self.config
         info = walks(

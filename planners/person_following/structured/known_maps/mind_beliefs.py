@@ -20,10 +20,11 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from planners.person_following.motion import FORWARD, STAY
+from domains.core import FORWARD, STAY
 from planners.person_following.structured.frames import AHEAD
+from planners.person_following.structured.known_maps.mind_checks import PERIOD
 from planners.person_following.structured.known_maps.mind_walk import MindParticles
-from planners.person_following.structured.known_maps.minds import MAX_WALK, PERIOD
+from planners.person_following.structured.known_maps.minds import MAX_WALK
 from planners.person_following.structured.known_maps.ways import CLOCK, GONE, HEADS_FOR, OWN, PLACE, SCENE, Node, Ways
 
 Truth = tuple[tuple[int, int], tuple[int, int]]

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
 _MOST_GOALS, _MOST_LOST, _MOST_STEPS, _FARTHEST = 8, 64, 1000, 60
 _WIDEST = 99
-PERIOD = 60  # planners.person_following.structured.known_maps.minds.PERIOD
+PERIOD = 60
+"""After so many steps the clock of the model of minds looks the same."""
 
 
 def check_minds(model: MindModel, variables: dict[str, int]) -> None:

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from domains.core import EMPTY, GOAL, WALL
+from domains.core import EMPTY, FORWARD, GOAL, STAY, WALL
 from nesy.errors import UserError
 from planners.models.tables import DecisionTable, Parents, learn_distribution, learn_mean
-from planners.person_following.ialm import TIMEOUT, WAIT, Codec
-from planners.person_following.motion import FORWARD, NUM_HEADINGS, STAY
+from planners.person_following.ialm import TIMEOUT, Codec
+from planners.person_following.motion import NUM_HEADINGS, WAIT
 from planners.person_following.structured.frames import Frame, learn_frame, reckon
 from planners.person_following.structured.known_maps.intentions import learn_intentions
 from planners.person_following.structured.known_maps.minds import (

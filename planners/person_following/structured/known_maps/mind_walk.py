@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from domains.core import STAY
 from nesy.compiled import njit
-from planners.person_following.motion import STAY
 from planners.person_following.structured.known_maps.ways import PackedWays, feature, moved_chance
 from planners.search.random_bits import drawn, uniform
 from planners.search.walk import Kernels, register

@@ -37,8 +37,6 @@ from planners.person_following.structured.known_maps.scenes import Scenes
 
 PHASES = (2, 3, 4, 5, 6)
 """The clock is asked about as t modulo these."""
-PERIOD = 60
-"""After so many steps the clock looks the same."""
 MOVES = Parents(
     ("action", *(f"clock modulo {k}" for k in PHASES), "wall_ahead", "person_ahead"),
     tuple(range(3 + len(PHASES))),

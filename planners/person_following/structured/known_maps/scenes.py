@@ -13,20 +13,13 @@ that agrees with the scene wherever it shows anything; it is the robot's code x 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from domains.core import GOAL, UNSEEN, WALL
 from nesy.compiled import njit
 from planners.person_following.motion import NUM_HEADINGS, NUM_MOTIONS
-from planners.person_following.structured.frames import AHEAD, Frame
-
-if TYPE_CHECKING:
-    pass
-
-FAR = 255
-"""Length of a walk that does not exist."""
+from planners.person_following.structured.frames import AHEAD, FAR, Frame
 
 
 @dataclass(frozen=True)
@@ -304,7 +297,7 @@ def _walks(follows: np.ndarray, cell: np.ndarray, walk: np.ndarray) -> None:
             head += 1
             for k in range(number[q]):
                 source = sources[q, k]
-                if walk[source, c] == 255:
+                if walk[source, c] == FAR:
                     walk[source, c] = walk[q, c] + 1
                     queue[tail] = source
                     tail += 1

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from domains.core import GOAL
+from domains.core import FORWARD, GOAL, STAY
 from nesy.compiled import njit
-from planners.person_following.motion import FORWARD, NUM_MOVES, STAY
-from planners.person_following.structured.known_maps.minds import MAX_STANDING, MAX_WALK, PERIOD, MindModel
+from planners.person_following.motion import NUM_MOVES
+from planners.person_following.structured.known_maps.mind_checks import PERIOD
+from planners.person_following.structured.known_maps.minds import MAX_STANDING, MAX_WALK, MindModel
 
 if TYPE_CHECKING:
     from planners.perception import Codec
