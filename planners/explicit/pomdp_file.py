@@ -3,14 +3,17 @@
 Preamble `discount`, `values` (reward or cost), `states`, `actions`, `observations` (a number or names), `start`
 (probabilities, uniform, one state, include, exclude); then `T`, `O` and `R` entries for single numbers, rows or
 whole matrices, with `*` for all, `identity`, `uniform` and `reset` (to the start distribution). Later entries replace
-earlier ones. Rows that rounding in the file keeps from summing to 1 are scaled. Transitions and rewards are kept
-sparse, so files with ten thousand states can be read.
-Source: A. Cassandra, "POMDP file format", pomdp.org.
+earlier ones (planners.pomdp_entries). Rows that rounding in the file keeps from summing to 1 are scaled.
+Source: A. Cassandra, "POMDP file format", pomdp.org, and the scanner and grammar of pomdp-solve. More is taken than
+they take: docs/planners.md, "What the reader takes".
 """
 
 from __future__ import annotations
 
+import codecs
+import difflib
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,13 +21,36 @@ from scipy import sparse
 
 from nesy.errors import UserError
 from nesy.run_folder import atomic_path
-from planners.explicit.pomdp import TabularPOMDP
+from planners.pomdp import TabularPOMDP
+from planners.pomdp_entries import Entries, expected_reward, transition_matrices
 
-_KEYWORDS = ("discount", "values", "states", "actions", "observations", "start", "T", "O", "R")
-_ROUNDING = 1e-3  # how far a row may be from summing to 1
+_KINDS = ("states", "actions", "observations")
+_PREAMBLE = ("discount", "values", *_KINDS, "start")
+_RESERVED = {*_PREAMBLE, *"TOR", "uniform", "identity", "reset", "reward", "cost", "include", "exclude"}
+_TOKEN = re.compile(r":|[^\s:]+")
+_GLUED = re.compile(r"[A-Za-z][\w-]*|\d+(?:\.\d*)?(?:[eE][+-]?\d+)?|[*+-]")  # tokens of pomdp-solve's scanner
+_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
+_ROUNDING = 1e-3  # how far a distribution may be from summing to 1
 _LARGEST = 50_000_000  # entries of a table that a file may name at once
 _MOST_NAMES = 1_000_000  # states, actions or observations that a file may count up
-RewardEntry = tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None, np.ndarray]
+
+ESCAPED = "# names by nesy: _0xHH_ is the character of that code; n_0x_ at the beginning is nothing"
+"""The line of a file some of whose names are escaped."""
+
+
+def escape(name: str) -> str:
+    """A name as a word that every reader of the format takes; different names stay different.
+
+    Words that are names already stay as they are. Other characters, and underscores that would look like an escape,
+    become `_0xHH_`; what does not begin with a letter then, or is a word of the format, gets `n_0x_` in front.
+    """
+    word = re.sub(r"[^A-Za-z0-9_-]|_(?=0x)", lambda found: f"_0x{ord(found[0]):x}_", name)
+    return word if re.match(r"[A-Za-z]", word) and word not in _RESERVED else f"n_0x_{word}"
+
+
+def unescape(word: str) -> str:
+    """The name that `escape` made a word of."""
+    return re.sub(r"_0x([0-9a-f]+)_", lambda found: chr(int(found[1], 16)), word.removeprefix("n_0x_"))
 
 
 def read(path: Path) -> TabularPOMDP:
@@ -34,121 +60,180 @@ def read(path: Path) -> TabularPOMDP:
         UserError: the file is missing, or a line is not understood; the message names the line.
     """
     try:
-        text = path.read_text(encoding="utf-8", errors="replace")
+        data = path.read_bytes()
     except FileNotFoundError:
         raise UserError(f"{path}: no such file") from None
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error})") from None
+    text = _decoded(data)
+    if text.lstrip().startswith("<"):
+        raise UserError(f"{path}, line 1: this is XML (POMDPX?); only Cassandra's .pomdp format is read")
     return _Reader(text, str(path)).model()
 
 
-Row = dict[int, float] | np.ndarray
-"""One row of transitions: {next state: chance}, or all of it."""
+def _decoded(data: bytes) -> str:
+    """Text in UTF-8, or in UTF-16 with its mark; comments of old files may be in Latin-1."""
+    try:
+        text = data.decode("utf-16" if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig")
+    except UnicodeDecodeError:
+        text = data.decode("latin-1")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-class _Reader:
-    """Tokens of one file, with their lines, and what has been read so far."""
+class _Scanner:
+    """Tokens of a text with their lines, a line at a time; the next token is the last one of the stack."""
 
     def __init__(self, text: str, name: str) -> None:
-        self.name, self.at = name, 0
-        self.tokens: list[str] = []
-        self.lines: list[int] = []
-        for number, line in enumerate(text.splitlines(), 1):
-            for token in re.findall(r":|[^\s:]+", line.split("#", 1)[0]):
-                self.tokens.append(token)
-                self.lines.append(number)
+        self.name, self.line = name, 1
+        self._rest = enumerate(text.split("\n"), 1)
+        self._tokens: list[str] = []
+        self._lines: list[int] = []
+
+    def fail(self, message: str) -> UserError:
+        """The error of the token taken last."""
+        return UserError(f"{self.name}, line {self.line}: {message}")
+
+    def peek(self, ahead: int = 0) -> str | None:
+        """A token to come; None behind the end."""
+        while len(self._tokens) <= ahead:
+            for number, line in self._rest:
+                found = _TOKEN.findall(line.partition("#")[0])
+                if found:
+                    self._tokens = found[::-1] + self._tokens
+                    self._lines = [number] * len(found) + self._lines
+                    break
+            else:
+                return None
+        return self._tokens[-1 - ahead]
+
+    def take(self) -> str:
+        """The next token."""
+        if self.peek() is None:
+            raise self.fail("the file ends in the middle of an entry")
+        self.line = self._lines.pop()
+        return self._tokens.pop()
+
+    def split(self, token: str) -> bool:
+        """Puts a token taken back as the several that pomdp-solve sees in it (`*-5`); False where it sees none."""
+        parts = _GLUED.findall(token)
+        if len(parts) < 2 or "".join(parts) != token:
+            return False
+        self._tokens += parts[::-1]
+        self._lines += [self.line] * len(parts)
+        return True
+
+    def colon(self) -> None:
+        """Takes a colon."""
+        if (token := self.take()) != ":":
+            raise self.fail(f"expected ':', found '{token}'")
+
+    def number(self) -> float:
+        """A number; its sign may stand apart."""
+        token = self.take()
+        sign = token if token in ("+", "-") else ""
+        if sign:
+            token = self.take()
+        if not (sign and token[0] in "+-"):
+            if _NUMBER.fullmatch(token) and np.isfinite(value := float(sign + token)):
+                return value
+            if self.split(token):
+                return float(f"{sign}1") * self.number()
+        raise self.fail(f"expected a number, found '{token}'")
+
+    def numbers(self, count: int) -> np.ndarray:
+        """As many numbers: float64 [count]."""
+        if count > _LARGEST:
+            raise self.fail(f"a table of {count} numbers is too large")
+        out, filled = np.empty(count), 0
+        while filled < count:
+            self.peek()
+            some = max(1, min(count - filled, len(self._tokens)))
+            try:
+                out[filled : filled + some] = list(map(float, tokens := self._tokens[: -some - 1 : -1]))
+                plain = bool(tokens) and np.isfinite(out[filled : filled + some]).all() and "_" not in "".join(tokens)
+            except ValueError:
+                plain = False
+            if plain:
+                self.line = self._lines[-some]
+                del self._tokens[-some:], self._lines[-some:]
+            else:
+                out[filled : filled + some] = [self.number() for _ in range(some)]
+            filled += some
+        return out
+
+
+class _Reader(_Scanner):
+    """What has been read of a file so far."""
+
+    def __init__(self, text: str, name: str) -> None:
+        super().__init__(text, name)
+        self.escaped = bool(re.search(f"^{re.escape(ESCAPED)}$", text, re.MULTILINE))
         self.names: dict[str, list[str]] = {}
         self.places: dict[str, dict[str, int]] = {}
         self.discount, self.sign = 1.0, 1.0
         self.start: np.ndarray | None = None
 
-    def fail(self, message: str) -> UserError:
-        line = self.lines[min(self.at, len(self.lines) - 1)] if self.lines else 1
-        return UserError(f"{self.name}, line {line}: {message}")
+    def at_heading(self) -> bool:
+        """Whether a word and a colon come (or `start include:`)."""
+        listed = self.peek() == "start" and self.peek(1) in ("include", "exclude") and self.peek(2) == ":"
+        return self.peek(1) == ":" or listed
 
-    def peek(self, ahead: int = 0) -> str | None:
-        position = self.at + ahead
-        return self.tokens[position] if position < len(self.tokens) else None
+    def listed(self) -> list[str]:
+        """The words before the next heading."""
+        words = []
+        while self.peek() is not None and not self.at_heading():
+            if (word := self.take()) in (":", "*"):
+                raise self.fail(f"expected a name, found '{word}'")
+            words.append(word)
+        return words
 
-    def take(self) -> str:
-        if self.at >= len(self.tokens):
-            raise self.fail("the file ends in the middle of an entry")
-        self.at += 1
-        return self.tokens[self.at - 1]
-
-    def colon(self) -> None:
-        if self.peek() != ":":
-            raise self.fail(f"expected ':', found '{self.peek()}'")
-        self.at += 1
-
-    def number(self) -> float:
+    def which(self, kind: str) -> int | None:
+        """What a name or a number stands for; None for `*`."""
         token = self.take()
-        try:
-            value = float(token)
-        except ValueError:
-            value = np.nan
-        if not np.isfinite(value):
-            self.at -= 1
-            raise self.fail(f"expected a number, found '{token}'")
-        return value
-
-    def numbers(self, count: int) -> np.ndarray:
-        if count > _LARGEST:
-            raise self.fail(f"a table of {count} numbers is too large")
-        return np.array([self.number() for _ in range(count)])
-
-    def at_keyword(self) -> bool:
-        return self.peek() in _KEYWORDS and (self.peek(1) == ":" or self.peek() == "start")
-
-    def which(self, kind: str) -> np.ndarray:
-        """Indices that a name, a number or `*` stands for."""
-        names, token = self.names[kind], self.take()
         if token == "*":
-            return np.arange(len(names))
-        if token in self.places[kind]:
-            return np.array([self.places[kind][token]])
-        if token.isdecimal() and int(token) < len(names):
-            return np.array([int(token)])
-        self.at -= 1
+            return None
+        place = self.places[kind].get(token)
+        if place is not None:
+            return place
+        if token.isdecimal() and int(token) < len(self.names[kind]):
+            return int(token)
+        if self.split(token):
+            return self.which(kind)
         raise self.fail(f"unknown {kind[:-1]} '{token}'")
 
     def model(self) -> TabularPOMDP:
-        while self.at_keyword() and self.peek() not in ("T", "O", "R"):
-            self.preamble()
-        for kind in ("states", "actions", "observations"):
-            if not self.names.get(kind):
-                raise self.fail(f"the preamble lacks '{kind}:'")
-        num_states, num_actions = len(self.names["states"]), len(self.names["actions"])
-        num_observations = len(self.names["observations"])
+        self.preamble()
+        sizes = [len(self.names[kind]) for kind in _KINDS]
+        num_states, num_actions, num_observations = sizes
         if num_actions * num_states * num_observations > _LARGEST:
             raise UserError(f"{self.name}: {num_states} states and {num_observations} observations are too many")
-        if self.start is None:
-            self.start = np.full(num_states, 1.0 / num_states)
-        transition: list[list[Row]] = [[{} for _ in range(num_states)] for _ in range(num_actions)]
+        transitions = Entries((num_actions, num_states, num_states))
+        rewards = Entries((num_actions, num_states, num_states, num_observations))
         observation = np.zeros((num_actions, num_states, num_observations))
-        rewards: list[RewardEntry] = []
-        while self.at < len(self.tokens):
+        while self.peek() is not None:
             keyword = self.take()
-            if keyword not in ("T", "O", "R"):
-                self.at -= 1
-                raise self.fail(f"expected 'T:', 'O:' or 'R:', found '{keyword}'")
-            self.colon()
             if keyword == "R":
-                rewards.append(self.reward_entry())
+                self.reward_entry(rewards)
             elif keyword == "T":
-                self.transition_entry(transition)
-            else:
+                self.transition_entry(transitions)
+            elif keyword == "O":
                 self.observation_entry(observation)
-        matrices = [self.matrix(rows, action) for rows, action in zip(transition, self.names["actions"], strict=True)]
+            else:
+                raise self.fail(f"expected 'T:', 'O:' or 'R:', found '{keyword}'")
+        states, actions, observations = (
+            tuple(map(unescape, self.names[kind]) if self.escaped else self.names[kind]) for kind in _KINDS
+        )
+        matrices = transition_matrices(transitions, actions, states, self.name)
         sums = observation.sum(axis=2, keepdims=True)
         observation = np.where(np.abs(sums - 1) <= _ROUNDING, observation / np.where(sums > 0, sums, 1.0), observation)
-        reward = self.expected_reward(rewards, matrices, observation)
+        reward = self.sign * expected_reward(rewards, matrices, observation) + 0.0
         stays = np.all([m.diagonal() > 1 - 1e-12 for m in matrices], axis=0)
+        assert self.start is not None
         try:
             return TabularPOMDP(
-                states=tuple(self.names["states"]),
-                actions=tuple(self.names["actions"]),
-                observations=tuple(self.names["observations"]),
+                states=states,
+                actions=actions,
+                observations=observations,
                 transition=matrices,
                 observation=observation,
                 reward=reward,
@@ -160,24 +245,41 @@ class _Reader:
             raise UserError(f"{self.name}: {error}") from None
 
     def preamble(self) -> None:
-        keyword = self.take()
-        if keyword == "start":
-            self.read_start()
-            return
+        given = set()
+        while (keyword := self.peek()) is not None and keyword not in ("T", "O", "R"):
+            self.take()
+            if keyword not in _PREAMBLE:
+                close = difflib.get_close_matches(keyword.lower(), _PREAMBLE, 1)
+                hint = f"did you mean '{close[0]}:'?" if close else f"it takes {', '.join(_PREAMBLE)}"
+                raise self.fail(f"unknown word '{keyword}' in the preamble; {hint}")
+            if keyword in given:
+                raise self.fail(f"'{keyword}:' is there twice")
+            given.add(keyword)
+            self.preamble_entry(keyword)
+        for kind in _KINDS:
+            if kind not in self.names:
+                raise self.fail(f"the preamble lacks '{kind}:'")
+        if self.start is None:
+            self.start = np.full(len(self.names["states"]), 1.0 / len(self.names["states"]))
+
+    def preamble_entry(self, keyword: str) -> None:
+        chosen = self.take() if keyword == "start" and self.peek() in ("include", "exclude") else None
         self.colon()
         if keyword == "discount":
             self.discount = self.number()
         elif keyword == "values":
             kind = self.take()
-            if kind not in ("reward", "cost"):
+            if kind not in ("reward", "rewards", "cost", "costs"):
                 raise self.fail(f"values are 'reward' or 'cost', not '{kind}'")
-            self.sign = 1.0 if kind == "reward" else -1.0
+            self.sign = 1.0 if kind.startswith("reward") else -1.0
+        elif keyword == "start":
+            if "states" not in self.names:
+                raise self.fail("'start' comes before 'states:'")
+            self.start = self.start_among(chosen) if chosen else self.start_belief()
         else:
-            words = []
-            while self.at < len(self.tokens) and not self.at_keyword():
-                words.append(self.take())
+            words = self.listed()
             if len(words) == 1 and words[0].isdecimal():
-                if int(words[0]) > _MOST_NAMES:
+                if int(words[0][:9]) > _MOST_NAMES or len(words[0]) > 9:
                     raise self.fail(f"{words[0]} {keyword} are too many")
                 words = [str(i) for i in range(int(words[0]))]
             if not words:
@@ -187,174 +289,119 @@ class _Reader:
             self.names[keyword] = words
             self.places[keyword] = {word: i for i, word in enumerate(words)}
 
-    def read_start(self) -> None:
-        if "states" not in self.names:
-            raise self.fail("'start' comes before 'states:'")
+    def start_among(self, chosen: str) -> np.ndarray:
+        """`start include:` and `start exclude:`: uniform over the states listed, or over the others."""
+        listed = np.zeros(len(self.names["states"]), np.bool_)
+        while self.peek() is not None and not self.at_heading():
+            state = self.which("states")
+            listed[slice(None) if state is None else state] = True
+        mask = listed if chosen == "include" else ~listed
+        if not mask.any():
+            raise self.fail("no state is left to start in")
+        return np.asarray(mask / mask.sum())
+
+    def start_belief(self) -> np.ndarray:
+        """`start:` with a state, `uniform` or a probability for every state."""
         count = len(self.names["states"])
-        chosen = self.take() if self.peek() in ("include", "exclude") else None
+        words = self.listed()
+        if words == ["uniform"]:
+            return np.full(count, 1.0 / count)
+        if len(words) == 1 and (words[0] in self.places["states"] or (words[0].isdecimal() and int(words[0]) < count)):
+            return np.eye(1, count, self.places["states"].get(words[0], int(words[0]) if words[0].isdecimal() else 0))[0]
+        wrong = next((word for word in words if not _NUMBER.fullmatch(word)), None)
+        if len(words) == count and wrong is None:
+            return np.array(words, np.float64)
+        found = f"{len(words)} numbers" if wrong is None else f"'{wrong}'"
+        raise self.fail(
+            f"'start:' takes a state, 'uniform' or a probability for each of the {count} states, found {found}; "
+            "several states are listed after 'start include:'"
+        )
+
+    def transition_entry(self, entries: Entries) -> None:
         self.colon()
-        if chosen is not None:
-            listed = np.zeros(count, np.bool_)
-            while self.at < len(self.tokens) and not self.at_keyword():
-                listed[self.which("states")] = True
-            mask = listed if chosen == "include" else ~listed
-            if not mask.any():
-                raise self.fail("no state is left to start in")
-            self.start = mask / mask.sum()
-        elif self.peek() == "uniform":
+        action, count = self.which("actions"), len(self.names["states"])
+        if self.peek() != ":":
+            self.transition_block(entries, (action,), (count, count))
+            return
+        self.colon()
+        state = self.which("states")
+        if self.peek() != ":":
+            self.transition_block(entries, (action, state), (count,))
+            return
+        self.colon()
+        entries.put((action, state, self.which("states")), self.value())
+
+    def transition_block(self, entries: Entries, where: tuple[int | None, ...], shape: tuple[int, ...]) -> None:
+        """A row or a matrix of transitions, or the word for one."""
+        word, every = self.peek(), np.arange(shape[-1])
+        if word in ("uniform", "reset") or (word == "identity" and len(shape) == 2):
             self.take()
-            self.start = np.full(count, 1.0 / count)
-        elif self._words_to_keyword() == 1 and count > 1:
-            self.start = np.zeros(count)
-            self.start[self.which("states")] = 1.0
+        whole = (*where, *[None] * (2 - len(where)))
+        if word == "uniform":
+            entries.put((*whole, None), 1.0 / shape[-1])
+        elif word == "reset":
+            assert self.start is not None
+            entries.put_block(whole, (every,), self.start)
+        elif word == "identity" and len(shape) == 2:
+            entries.put_block(where, (every, every), np.ones(len(every)))
         else:
-            self.start = self.numbers(count)
-
-    def _words_to_keyword(self) -> int:
-        """How many tokens there are before the next keyword."""
-        begin = self.at
-        while self.at < len(self.tokens) and not self.at_keyword():
-            self.at += 1
-        count, self.at = self.at - begin, begin
-        return count
-
-    def transition_entry(self, table: list[list[Row]]) -> None:
-        actions, count = self.which("actions"), len(self.names["states"])
-        if self.peek() != ":":
-            rows = self.block((count, count))
-            for a in actions:
-                for s in range(count):
-                    table[a][s] = {s: 1.0} if rows is None else rows[s]
-            return
-        self.colon()
-        states = self.which("states")
-        if self.peek() != ":":
-            whole = self.block((count,))
-            assert whole is not None
-            for a in actions:
-                for s in states:
-                    table[a][s] = whole
-            return
-        self.colon()
-        after, chance = self.which("states"), self.number()
-        for a in actions:
-            for s in states:
-                if len(after) == count:
-                    table[a][s] = np.full(count, chance) if chance else {}
-                    continue
-                row = table[a][s]
-                if not isinstance(row, dict):
-                    row = dict(enumerate(row.tolist()))
-                table[a][s] = row | {int(after[0]): chance}
+            block = self.numbers(int(np.prod(shape))).reshape(shape)
+            cells = np.nonzero(block)
+            entries.put_block(where, cells, block[cells])
 
     def observation_entry(self, table: np.ndarray) -> None:
-        actions = self.which("actions")
-        if self.peek() != ":":
-            table[actions] = self.block(table.shape[1:], uniform_only=True)
+        """One probability, a row or a matrix of observations, straight into the table [A, S, O]."""
+        self.colon()
+        where: list[int | slice] = []
+        for kind in ("actions", "states", "observations"):
+            if where:
+                self.colon()
+            place = self.which(kind)
+            where.append(slice(None) if place is None else place)
+            if self.peek() != ":" or len(where) == 3:
+                break
+        shape = table.shape[len(where) :]
+        if not shape:
+            table[tuple(where)] = self.value()
+        elif self.peek() == "uniform":
+            self.take()
+            table[tuple(where)] = 1.0 / shape[-1]
+        else:
+            table[tuple(where)] = self.numbers(int(np.prod(shape))).reshape(shape)
+
+    def reward_entry(self, entries: Entries) -> None:
+        self.colon()
+        where: list[int | None] = []
+        for kind in ("actions", "states", "states", "observations"):
+            if where:
+                self.colon()
+            where.append(self.which(kind))
+            if len(where) > 1 and self.peek() != ":":
+                break
+        shape = (len(self.names["states"]), len(self.names["observations"]))[len(where) - 2 :]
+        if not shape:
+            entries.put(where, self.value())
             return
-        self.colon()
-        states = self.which("states")
-        if self.peek() != ":":
-            table[np.ix_(actions, states)] = self.block(table.shape[2:], uniform_only=True)
-            return
-        self.colon()
-        seen = self.which("observations")
-        table[np.ix_(actions, states, seen)] = self.number()
+        block = self.numbers(int(np.prod(shape))).reshape(shape)
+        cells = np.nonzero(block)
+        entries.put_block(where, cells, block[cells])
 
-    def block(self, shape: tuple[int, ...], uniform_only: bool = False) -> np.ndarray | None:
-        """A row or a matrix of numbers, or the word for one; None stands for the identity."""
-        word = self.peek()
-        if word == "uniform":
-            self.take()
-            return np.broadcast_to(np.full(shape[-1], 1.0 / shape[-1]), shape)
-        if word == "reset" and not uniform_only:
-            self.take()
-            assert self.start is not None
-            return np.broadcast_to(self.start, shape)
-        if word == "identity" and not uniform_only and len(shape) == 2:
-            self.take()
-            return None
-        return self.numbers(int(np.prod(shape))).reshape(shape)
-
-    def matrix(self, rows: list[Row], action: str) -> sparse.csr_array:
-        """The rows of one action as a sparse matrix; each sums to 1 up to rounding."""
-        count = len(rows)
-        indices, values, ends = [], [], [0]
-        for s, row in enumerate(rows):
-            index, value = (
-                (np.array(sorted(row), np.int64), np.array([row[t] for t in sorted(row)], np.float64))
-                if isinstance(row, dict)
-                else (np.flatnonzero(row), row[np.flatnonzero(row)])
-            )
-            total = value.sum()
-            if abs(total - 1) > _ROUNDING or (value < 0).any():
-                state = self.names["states"][s]
-                wrong = "hold a negative number" if (value < 0).any() else f"sum to {total:.6g}, not 1"
-                raise UserError(f"{self.name}: transitions of action '{action}' in state '{state}' {wrong}")
-            indices.append(index[value > 0])
-            values.append(value[value > 0] / total)
-            ends.append(ends[-1] + len(indices[-1]))
-        return sparse.csr_array((np.concatenate(values), np.concatenate(indices), np.array(ends)), (count, count))
-
-    def reward_entry(self) -> RewardEntry:
-        num_states, num_observations = len(self.names["states"]), len(self.names["observations"])
-        actions = self.which("actions")
-        self.colon()
-        states = self.which("states")
-        if self.peek() != ":":
-            return actions, states, None, None, self.numbers(num_states * num_observations)
-        self.colon()
-        after = self.which("states")
-        if self.peek() != ":":
-            return actions, states, after, None, self.numbers(num_observations)
-        self.colon()
-        seen = self.which("observations")
-        return actions, states, after, seen, self.numbers(1)
-
-    def expected_reward(
-        self, entries: list[RewardEntry], transition: list[sparse.csr_array], observation: np.ndarray
-    ) -> np.ndarray:
-        """R[a, s] = sum_s' T sum_o Z R(a, s, s', o), row by row, over the successors that a row has."""
-        num_actions, num_states, num_observations = observation.shape
-        out = np.zeros((num_actions, num_states))
-        wide: list[list[int]] = [[] for _ in range(num_actions)]  # entries of all states, by action
-        single: dict[tuple[int, int], list[int]] = {}
-        for number, (actions, states, *_) in enumerate(entries):
-            for a in actions:
-                if len(states) > 1 or num_states == 1:
-                    wide[a].append(number)
-                else:
-                    single.setdefault((int(a), int(states[0])), []).append(number)
-        for a in range(num_actions):
-            for s in range(num_states):
-                found = sorted(wide[a] + single.get((a, s), []))
-                if found:
-                    begin, end = transition[a].indptr[s : s + 2]
-                    reached, chance = transition[a].indices[begin:end], transition[a].data[begin:end]
-                    table = np.zeros((len(reached), num_observations))
-                    for number in found:
-                        _, _, after, seen, values = entries[number]
-                        if after is None:
-                            table[:] = values.reshape(num_states, num_observations)[reached]
-                            continue
-                        rows = slice(None) if len(after) == num_states else reached == after[0]
-                        if seen is None:
-                            table[rows] = values
-                        elif len(seen) == num_observations:
-                            table[rows] = values[0]
-                        else:
-                            table[rows, seen[0]] = values[0]
-                    out[a, s] = self.sign * float(chance @ (observation[a][reached] * table).sum(axis=1))
-        return out
+    def value(self) -> float:
+        """The number of an entry; some files have a colon before it."""
+        if self.peek() == ":":
+            self.colon()
+        return self.number()
 
 
 def write(model: TabularPOMDP, path: Path) -> None:
-    """Write a model with its non-zero entries; names that are no words are replaced by numbers."""
-    lines = [f"discount: {model.discount!r}", "values: reward"]
-    for kind in ("states", "actions", "observations"):
-        names = getattr(model, kind)
-        words = all(re.fullmatch(r"[A-Za-z][\w-]*", name) for name in names) and len(set(names)) == len(names)
-        lines.append(f"{kind}: {' '.join(names) if words and not set(names) & set(_KEYWORDS) else len(names)}")
+    """Write a model with its non-zero entries; `read` gives its names back, other readers see them escaped."""
+    lines = [f"discount: {float(model.discount)!r}", "values: reward"]
+    for kind in _KINDS:
+        words, numbers = [escape(name) for name in getattr(model, kind)], [str(i) for i in range(len(getattr(model, kind)))]
+        counted = list(getattr(model, kind)) == numbers
+        if not counted and words != list(getattr(model, kind)) and lines[0] != ESCAPED:
+            lines.insert(0, ESCAPED)
+        lines.append(f"{kind}: {len(words) if counted else ' '.join(words)}")
     lines.append("start: " + " ".join(repr(float(p)) for p in model.start))
     for a in range(len(model.actions)):
         entries = sparse.coo_array(model.transition[a])
