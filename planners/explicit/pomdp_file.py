@@ -10,10 +10,8 @@ they take: docs/planners.md, "What the reader takes".
 
 from __future__ import annotations
 
-import codecs
 import difflib
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,15 +21,12 @@ from nesy.errors import UserError
 from nesy.run_folder import atomic_path
 from planners.pomdp import TabularPOMDP
 from planners.pomdp_entries import Entries, expected_reward, transition_matrices
+from planners.pomdp_tokens import LARGEST, NUMBER, Scanner, decoded
 
 _KINDS = ("states", "actions", "observations")
 _PREAMBLE = ("discount", "values", *_KINDS, "start")
 _RESERVED = {*_PREAMBLE, *"TOR", "uniform", "identity", "reset", "reward", "cost", "include", "exclude"}
-_TOKEN = re.compile(r":|[^\s:]+")
-_GLUED = re.compile(r"[A-Za-z][\w-]*|\d+(?:\.\d*)?(?:[eE][+-]?\d+)?|[*+-]")  # tokens of pomdp-solve's scanner
-_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _ROUNDING = 1e-3  # how far a distribution may be from summing to 1
-_LARGEST = 50_000_000  # entries of a table that a file may name at once
 _MOST_NAMES = 1_000_000  # states, actions or observations that a file may count up
 
 ESCAPED = "# names by nesy: _0xHH_ is the character of that code; n_0x_ at the beginning is nothing"
@@ -50,7 +45,9 @@ def escape(name: str) -> str:
 
 def unescape(word: str) -> str:
     """The name that `escape` made a word of."""
-    return re.sub(r"_0x([0-9a-f]+)_", lambda found: chr(int(found[1], 16)), word.removeprefix("n_0x_"))
+    return re.sub(
+        r"_0x(10[0-9a-f]{4}|[0-9a-f]{1,5})_", lambda found: chr(int(found[1], 16)), word.removeprefix("n_0x_")
+    )
 
 
 def read(path: Path) -> TabularPOMDP:
@@ -65,104 +62,13 @@ def read(path: Path) -> TabularPOMDP:
         raise UserError(f"{path}: no such file") from None
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error})") from None
-    text = _decoded(data)
+    text = decoded(data)
     if text.lstrip().startswith("<"):
         raise UserError(f"{path}, line 1: this is XML (POMDPX?); only Cassandra's .pomdp format is read")
     return _Reader(text, str(path)).model()
 
 
-def _decoded(data: bytes) -> str:
-    """Text in UTF-8, or in UTF-16 with its mark; comments of old files may be in Latin-1."""
-    try:
-        text = data.decode("utf-16" if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig")
-    except UnicodeDecodeError:
-        text = data.decode("latin-1")
-    return text.replace("\r\n", "\n").replace("\r", "\n")
-
-
-class _Scanner:
-    """Tokens of a text with their lines, a line at a time; the next token is the last one of the stack."""
-
-    def __init__(self, text: str, name: str) -> None:
-        self.name, self.line = name, 1
-        self._rest = enumerate(text.split("\n"), 1)
-        self._tokens: list[str] = []
-        self._lines: list[int] = []
-
-    def fail(self, message: str) -> UserError:
-        """The error of the token taken last."""
-        return UserError(f"{self.name}, line {self.line}: {message}")
-
-    def peek(self, ahead: int = 0) -> str | None:
-        """A token to come; None behind the end."""
-        while len(self._tokens) <= ahead:
-            for number, line in self._rest:
-                found = _TOKEN.findall(line.partition("#")[0])
-                if found:
-                    self._tokens = found[::-1] + self._tokens
-                    self._lines = [number] * len(found) + self._lines
-                    break
-            else:
-                return None
-        return self._tokens[-1 - ahead]
-
-    def take(self) -> str:
-        """The next token."""
-        if self.peek() is None:
-            raise self.fail("the file ends in the middle of an entry")
-        self.line = self._lines.pop()
-        return self._tokens.pop()
-
-    def split(self, token: str) -> bool:
-        """Puts a token taken back as the several that pomdp-solve sees in it (`*-5`); False where it sees none."""
-        parts = _GLUED.findall(token)
-        if len(parts) < 2 or "".join(parts) != token:
-            return False
-        self._tokens += parts[::-1]
-        self._lines += [self.line] * len(parts)
-        return True
-
-    def colon(self) -> None:
-        """Takes a colon."""
-        if (token := self.take()) != ":":
-            raise self.fail(f"expected ':', found '{token}'")
-
-    def number(self) -> float:
-        """A number; its sign may stand apart."""
-        token = self.take()
-        sign = token if token in ("+", "-") else ""
-        if sign:
-            token = self.take()
-        if not (sign and token[0] in "+-"):
-            if _NUMBER.fullmatch(token) and np.isfinite(value := float(sign + token)):
-                return value
-            if self.split(token):
-                return float(f"{sign}1") * self.number()
-        raise self.fail(f"expected a number, found '{token}'")
-
-    def numbers(self, count: int) -> np.ndarray:
-        """As many numbers: float64 [count]."""
-        if count > _LARGEST:
-            raise self.fail(f"a table of {count} numbers is too large")
-        out, filled = np.empty(count), 0
-        while filled < count:
-            self.peek()
-            some = max(1, min(count - filled, len(self._tokens)))
-            try:
-                out[filled : filled + some] = list(map(float, tokens := self._tokens[: -some - 1 : -1]))
-                plain = bool(tokens) and np.isfinite(out[filled : filled + some]).all() and "_" not in "".join(tokens)
-            except ValueError:
-                plain = False
-            if plain:
-                self.line = self._lines[-some]
-                del self._tokens[-some:], self._lines[-some:]
-            else:
-                out[filled : filled + some] = [self.number() for _ in range(some)]
-            filled += some
-        return out
-
-
-class _Reader(_Scanner):
+class _Reader(Scanner):
     """What has been read of a file so far."""
 
     def __init__(self, text: str, name: str) -> None:
@@ -189,12 +95,11 @@ class _Reader(_Scanner):
 
     def which(self, kind: str) -> int | None:
         """What a name or a number stands for; None for `*`."""
-        token = self.take()
+        token, places = self.take(), self.places[kind]
+        if token in places:
+            return places[token]
         if token == "*":
             return None
-        place = self.places[kind].get(token)
-        if place is not None:
-            return place
         if token.isdecimal() and int(token) < len(self.names[kind]):
             return int(token)
         if self.split(token):
@@ -205,7 +110,7 @@ class _Reader(_Scanner):
         self.preamble()
         sizes = [len(self.names[kind]) for kind in _KINDS]
         num_states, num_actions, num_observations = sizes
-        if num_actions * num_states * num_observations > _LARGEST:
+        if num_actions * num_states * num_observations > LARGEST:
             raise UserError(f"{self.name}: {num_states} states and {num_observations} observations are too many")
         transitions = Entries((num_actions, num_states, num_states))
         rewards = Entries((num_actions, num_states, num_states, num_observations))
@@ -307,8 +212,10 @@ class _Reader(_Scanner):
         if words == ["uniform"]:
             return np.full(count, 1.0 / count)
         if len(words) == 1 and (words[0] in self.places["states"] or (words[0].isdecimal() and int(words[0]) < count)):
-            return np.eye(1, count, self.places["states"].get(words[0], int(words[0]) if words[0].isdecimal() else 0))[0]
-        wrong = next((word for word in words if not _NUMBER.fullmatch(word)), None)
+            return np.eye(1, count, self.places["states"].get(words[0], int(words[0]) if words[0].isdecimal() else 0))[
+                0
+            ]
+        wrong = next((word for word in words if not NUMBER.fullmatch(word)), None)
         if len(words) == count and wrong is None:
             return np.array(words, np.float64)
         found = f"{len(words)} numbers" if wrong is None else f"'{wrong}'"
@@ -341,7 +248,8 @@ class _Reader(_Scanner):
             entries.put((*whole, None), 1.0 / shape[-1])
         elif word == "reset":
             assert self.start is not None
-            entries.put_block(whole, (every,), self.start)
+            begins = np.flatnonzero(self.start)
+            entries.put_block(whole, (begins,), self.start[begins])
         elif word == "identity" and len(shape) == 2:
             entries.put_block(where, (every, every), np.ones(len(every)))
         else:
@@ -397,11 +305,13 @@ def write(model: TabularPOMDP, path: Path) -> None:
     """Write a model with its non-zero entries; `read` gives its names back, other readers see them escaped."""
     lines = [f"discount: {float(model.discount)!r}", "values: reward"]
     for kind in _KINDS:
-        words, numbers = [escape(name) for name in getattr(model, kind)], [str(i) for i in range(len(getattr(model, kind)))]
-        counted = list(getattr(model, kind)) == numbers
-        if not counted and words != list(getattr(model, kind)) and lines[0] != ESCAPED:
+        names = list(getattr(model, kind))
+        words = list(map(escape, names))
+        if names == [str(i) for i in range(len(names))]:
+            words = [str(len(names))]
+        elif words != names and lines[0] != ESCAPED:
             lines.insert(0, ESCAPED)
-        lines.append(f"{kind}: {len(words) if counted else ' '.join(words)}")
+        lines.append(f"{kind}: {' '.join(words)}")
     lines.append("start: " + " ".join(repr(float(p)) for p in model.start))
     for a in range(len(model.actions)):
         entries = sparse.coo_array(model.transition[a])

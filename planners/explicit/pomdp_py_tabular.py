@@ -9,6 +9,9 @@ wants actions as a list in a fixed order.
 
 from __future__ import annotations
 
+import inspect
+import itertools
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,8 +20,9 @@ import pomdp_py
 from scipy import sparse
 
 from nesy.errors import UserError
-from planners.explicit.pomdp import TabularPOMDP
-from planners.search.random_bits import stream, uniform
+from planners.pomdp import TabularPOMDP
+from planners.pomdp_py_rewards import expected_rewards
+from planners.random_bits import stream, uniform
 
 
 class TabularTransition(pomdp_py.TransitionModel):
@@ -132,8 +136,14 @@ def tabular(
     states: Sequence[Any] | None = None,
     observations: Sequence[Any] | None = None,
     terminal: Sequence[Any] = (),
+    actions: Sequence[Any] | None = None,
+    reward_draws: int | None = None,
 ) -> TabularPOMDP:
     """A pomdp-py problem as tables, so that our planners and the solver run on it.
+
+    States, actions and observations are told apart by equality, as pomdp-py does; those that print alike get numbers.
+    The reward of a step is the expectation where the reward model has probabilities over few values, else what it
+    always says.
 
     Args:
         agent: a `pomdp_py.Agent` whose transition and observation models have `probability`.
@@ -141,43 +151,118 @@ def tabular(
         states: all states; those of the transition model (`get_all_states`) by default.
         observations: all observations; those of the observation model by default.
         terminal: states that end an episode.
+        actions: all actions, allowed in every state; by default those of the policy model, which must be the same in
+            every state that is not terminal.
+        reward_draws: how often a reward is drawn to average it, where the model draws and tells no probabilities.
 
     Raises:
-        UserError: states or observations cannot be listed, or the probabilities do not sum to 1.
+        UserError: states, actions or observations cannot be listed, are listed twice or depend on the state, the
+            probabilities do not sum to 1, or rewards are drawn and `reward_draws` is not given.
     """
+    if reward_draws is not None and reward_draws < 1:
+        raise UserError(f"reward_draws must be at least 1, got {reward_draws}")
     try:
         states = list(agent.transition_model.get_all_states() if states is None else states)
         observations = list(agent.observation_model.get_all_observations() if observations is None else observations)
-        actions = list(agent.policy_model.get_all_actions())
     except (NotImplementedError, AttributeError):
-        raise UserError("the pomdp-py problem does not list its states, actions or observations: give them") from None
-    ends = np.array([state in list(terminal) for state in states], np.bool_)
+        raise UserError("the pomdp-py problem does not list its states or observations: give them") from None
+    places, seen_at = _places(states, "state"), _places(observations, "observation")
+    ends = np.zeros(len(states), np.bool_)
+    for state in terminal:
+        if state not in places:
+            raise UserError(f"the terminal state {state} is not among the states")
+        ends[places[state]] = True
+    going_on = [states[s] for s in np.flatnonzero(~ends)] or states
+    actions = list(actions) if actions is not None else _actions(agent, going_on)
+    _places(actions, "action")
     transition, observation = [], np.zeros((len(actions), len(states), len(observations)))
-    reward = np.zeros((len(actions), len(states)))
     for a, action in enumerate(actions):
         matrix = np.array([[_chance(agent.transition_model, t, s, action) for t in states] for s in states])
         matrix[ends] = np.eye(len(states))[ends]
         transition.append(sparse.csr_array(matrix))
         for j, state in enumerate(states):
-            for o, seen in enumerate(observations):
+            for seen, o in seen_at.items():
                 observation[a, j, o] = _chance(agent.observation_model, seen, state, action)
-            if not ends[j]:
-                reward[a, j] = sum(
-                    matrix[j, t] * agent.reward_model.sample(state, action, states[t])
-                    for t in np.flatnonzero(matrix[j])
-                )
-    belief = np.array([float(agent.belief[state]) for state in states])
     return TabularPOMDP(
-        states=tuple(map(str, states)),
-        actions=tuple(map(str, actions)),
-        observations=tuple(map(str, observations)),
+        states=_names(states),
+        actions=_names(actions),
+        observations=_names(observations),
         transition=transition,
         observation=observation,
-        reward=reward,
+        reward=expected_rewards(agent.reward_model, states, actions, transition, ends, reward_draws),
         discount=discount,
-        start=belief / belief.sum(),
+        start=_start(agent.belief, places),
         terminal=ends,
     )
+
+
+def _places(things: Sequence[Any], kind: str) -> dict[Any, int]:
+    """Where each thing stands; equal ones are one."""
+    places: dict[Any, int] = {}
+    for place, thing in enumerate(things):
+        try:
+            first = places.setdefault(thing, place)
+        except (NotImplementedError, TypeError):
+            raise UserError(f"{kind}s of class {type(thing).__name__} need __hash__ and __eq__") from None
+        if first != place:
+            raise UserError(f"the {kind} {thing} is listed twice")
+    return places
+
+
+def _names(things: Sequence[Any]) -> tuple[str, ...]:
+    """How things print; those that print alike are numbered from 1."""
+    texts = [str(thing) for thing in things]
+    often, taken, names = Counter(texts), set(texts), []
+    numbered = {text: (f"{text} ({n})" for n in itertools.count(1)) for text in texts}
+    for text in texts:
+        name = text if often[text] == 1 else next(other for other in numbered[text] if other not in taken)
+        taken.add(name)
+        names.append(name)
+    return tuple(names)
+
+
+def _actions(agent: Any, states: Sequence[Any]) -> list[Any]:
+    """The actions of the policy model, asked for in every state as pomdp-py's planners do."""
+    get, given = agent.policy_model.get_all_actions, {"history": agent.history}
+    parameters = inspect.signature(get).parameters.values()
+    takes = {parameter.name for parameter in parameters}
+    anything = any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in parameters)
+    first: tuple[Any, list[Any]] | None = None
+    for state in states:
+        asked = {k: v for k, v in {"state": state, **given}.items() if anything or k in takes}
+        try:
+            found = list(get(**asked))
+        except (NotImplementedError, AttributeError, TypeError) as error:
+            reason = f" ({error})" if str(error) else ""
+            raise UserError(f"get_all_actions(state, history) does not list the actions: give them{reason}") from None
+        if first is None:
+            first = state, found
+        elif _places(found, "action").keys() != _places(first[1], "action").keys():
+            raise UserError(
+                f"state {state} has other actions than state {first[0]}, and tables have one list for all states; "
+                "give `actions`, which are then allowed everywhere"
+            )
+    if first is None or not first[1]:
+        raise UserError("the policy model lists no actions: give them")
+    return first[1]
+
+
+def _start(belief: Any, places: dict[Any, int]) -> np.ndarray:
+    """The agent's belief: float64 [S]."""
+    try:
+        believed = dict.fromkeys(belief)
+    except (NotImplementedError, TypeError):
+        believed = dict.fromkeys(places)  # a distribution that cannot be gone through
+    out = np.zeros(len(places))
+    for state in believed:
+        chance = float(belief[state])
+        if chance > 0 and state not in places:
+            raise UserError(f"the belief holds {state}, which is not among the states")
+        if chance > 0:
+            out[places[state]] = chance
+    if not out.sum() > 0:
+        raise UserError("the agent's belief holds no state")
+    return np.asarray(out / out.sum())
 
 
 def _chance(model: Any, *arguments: Any) -> float:
