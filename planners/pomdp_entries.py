@@ -176,9 +176,12 @@ def _transitions(entries: Entries, action: int, count: int, name: str) -> sparse
     """The cells of one action that are not zero."""
     layers, every = entries.of(action), np.arange(count)
     rows, columns = [layer for layer in layers if not layer.fixed[1]], [layer for layer in layers if layer.fixed[1]]
-    ground, _ = entries.latest(rows, (every, every))  # what a row has where nothing names the next state
+    # What a row has where nothing names the next state, and since when; entries for all rows before that are gone.
+    ground, since = entries.latest(rows, (every, every))
     set_alone = [layer.keys[layer.values != 0] for layer in columns if layer.fixed[0]]
-    set_in_all = [layer.keys[layer.values != 0] for layer in columns if not layer.fixed[0]]
+    set_in_all = [
+        layer.keys[(layer.values != 0) & (layer.times > since.min())] for layer in columns if not layer.fixed[0]
+    ]
     none = np.zeros(0, np.int64)
     single, column = (_distinct(np.concatenate([none, *keys])) for keys in (set_alone, set_in_all))
     begins = np.searchsorted(single, np.arange(count + 1) * count)

@@ -213,9 +213,11 @@ def _names(things: Sequence[Any]) -> tuple[str, ...]:
     """How things print; those that print alike are numbered from 1."""
     texts = [str(thing) for thing in things]
     often, taken, names = Counter(texts), set(texts), []
-    numbered = {text: (f"{text} ({n})" for n in itertools.count(1)) for text in texts}
+    numbers = {text: itertools.count(1) for text in often}
     for text in texts:
-        name = text if often[text] == 1 else next(other for other in numbered[text] if other not in taken)
+        name = text
+        while often[text] > 1 and name in taken:
+            name = f"{text} ({next(numbers[text])})"
         taken.add(name)
         names.append(name)
     return tuple(names)
@@ -250,16 +252,15 @@ def _actions(agent: Any, states: Sequence[Any]) -> list[Any]:
 def _start(belief: Any, places: dict[Any, int]) -> np.ndarray:
     """The agent's belief: float64 [S]."""
     try:
-        believed = dict.fromkeys(belief)
-    except (NotImplementedError, TypeError):
-        believed = dict.fromkeys(places)  # a distribution that cannot be gone through
+        believed = dict(belief.get_histogram())
+    except (NotImplementedError, AttributeError):
+        believed = {state: belief[state] for state in places}  # a distribution that cannot be gone through
     out = np.zeros(len(places))
-    for state in believed:
-        chance = float(belief[state])
+    for state, chance in believed.items():
         if chance > 0 and state not in places:
             raise UserError(f"the belief holds {state}, which is not among the states")
         if chance > 0:
-            out[places[state]] = chance
+            out[places[state]] = float(chance)
     if not out.sum() > 0:
         raise UserError("the agent's belief holds no state")
     return np.asarray(out / out.sum())
