@@ -3,7 +3,7 @@
 Preamble `discount`, `values` (reward or cost), `states`, `actions`, `observations` (a number or names), `start`
 (probabilities, uniform, one state, include, exclude); then `T`, `O` and `R` entries for single numbers, rows or
 whole matrices, with `*` for all, `identity`, `uniform` and `reset` (to the start distribution). Later entries replace
-earlier ones (planners.pomdp_entries). Rows that rounding in the file keeps from summing to 1 are scaled.
+earlier ones (planners.explicit.pomdp_entries). Rows that rounding in the file keeps from summing to 1 are scaled.
 Source: A. Cassandra, "POMDP file format", pomdp.org, and the scanner and grammar of pomdp-solve. More is taken than
 they take: docs/planners.md, "What the reader takes".
 """
@@ -19,9 +19,9 @@ from scipy import sparse
 
 from nesy.errors import UserError
 from nesy.run_folder import atomic_path
-from planners.pomdp import TabularPOMDP
-from planners.pomdp_entries import Entries, expected_reward, transition_matrices
-from planners.pomdp_tokens import LARGEST, NUMBER, Scanner, decoded
+from planners.explicit.pomdp import TabularPOMDP
+from planners.explicit.pomdp_entries import Entries, expected_reward, transition_matrices
+from planners.explicit.pomdp_tokens import LARGEST, NUMBER, Scanner, decoded
 
 _KINDS = ("states", "actions", "observations")
 _PREAMBLE = ("discount", "values", *_KINDS, "start")

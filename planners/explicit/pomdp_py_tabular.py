@@ -20,9 +20,9 @@ import pomdp_py
 from scipy import sparse
 
 from nesy.errors import UserError
-from planners.pomdp import TabularPOMDP
-from planners.pomdp_py_rewards import expected_rewards
-from planners.random_bits import stream, uniform
+from planners.explicit.pomdp import TabularPOMDP
+from planners.explicit.pomdp_py_rewards import expected_rewards
+from planners.search.random_bits import stream, uniform
 
 
 class TabularTransition(pomdp_py.TransitionModel):

@@ -11,7 +11,7 @@ import pomdp_py
 import pytest
 
 from nesy.errors import UserError
-from planners.pomdp_py_tabular import TabularAgent, tabular
+from planners.explicit.pomdp_py_tabular import TabularAgent, tabular
 
 GO, STAY, SEEN = pomdp_py.SimpleAction("go"), pomdp_py.SimpleAction("stay"), pomdp_py.SimpleObservation("seen")
 A, B = pomdp_py.SimpleState("a"), pomdp_py.SimpleState("b")

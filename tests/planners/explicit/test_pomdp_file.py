@@ -12,9 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from nesy.errors import UserError
-from planners.pomdp import TabularPOMDP
-from planners.pomdp_entries import Entries, _transitions
-from planners.pomdp_file import escape, unescape
+from planners.explicit.pomdp import TabularPOMDP
+from planners.explicit.pomdp_entries import Entries, _transitions
+from planners.explicit.pomdp_file import escape, unescape
 
 PREAMBLE = "discount: 0.9\nvalues: reward\nstates: wet dry frozen\nactions: wait pump\nobservations: low high\n"
 TABLES = "T: * identity\nO: * uniform\nR: pump : wet : * : * 1\n"
