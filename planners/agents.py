@@ -57,6 +57,28 @@ class Agent(Protocol):
         """Actions int64 [B]."""
         ...
 
+    def person_belief(self) -> np.ndarray | None:
+        """What the agent took the person to see when it last acted.
+
+        Returns:
+            Float [B, N, K], per factor of the person's code a distribution, or NaN where the agent did not act; None
+            for agents that keep no such belief.
+        """
+        ...
+
+
+class Unbelieving:
+    """An agent that keeps no belief of what the person sees."""
+
+    def person_belief(self) -> None:
+        """None."""
+        return None
+
+
+def says_something(believed: np.ndarray) -> np.ndarray:
+    """Which beliefs [B, N, K] are not the same for all values of all factors: bool [B]; NaN and zeros say nothing."""
+    return np.asarray((believed.max(axis=-1) > believed.sum(axis=-1) / believed.shape[-1] + 1e-6).any(axis=-1))
+
 
 class DQNAgent:
     """Acts greedily on a trained belief DQN."""
@@ -65,6 +87,7 @@ class DQNAgent:
 
     def __init__(self, policy: DQNPolicy) -> None:
         self.policy = policy
+        self._given: np.ndarray | None = None
 
     @property
     def algorithm(self) -> str:
@@ -76,7 +99,12 @@ class DQNAgent:
     def actions(self, situation: Situation) -> np.ndarray:
         """Greedy actions."""
         assert situation.percepts is not None
+        self._given = np.where(situation.active[:, None, None], situation.percepts.shifted, np.nan)
         return self.policy.actions(situation.percepts, situation.allowed)
+
+    def person_belief(self) -> np.ndarray | None:
+        """The b~ that the network was given."""
+        return self._given
 
 
 class Planner(Protocol):
@@ -106,6 +134,7 @@ class BeliefAgent:
         self.beliefs: list[Any] = []
         self.planners: list[Any] = []
         self.infos: list[dict[str, Any]] = []
+        self._acted = np.zeros(0, np.bool_)
 
     def actions(self, situation: Situation) -> np.ndarray:
         """Update the beliefs of the active episodes and plan in each."""
@@ -116,7 +145,7 @@ class BeliefAgent:
         if situation.last_actions is None:
             self._begin(count)
         actions = np.zeros(count, np.int64)
-        self.infos = [{} for _ in range(count)]
+        self.infos, self._acted = [{} for _ in range(count)], situation.active.copy()
         poses = self.geometry.relative(percepts.configurations)
         seen, told = self._seen(situation), self._told(situation)
         shared = (time.perf_counter() - begun) / max(int(situation.active.sum()), 1)
@@ -133,6 +162,14 @@ class BeliefAgent:
             actions[i], info = self.planners[i].plan(belief.states, allowed, spent)
             self.infos[i] = info | {"effective": belief.effective, "resets": belief.resets}
         return actions
+
+    def person_belief(self) -> np.ndarray | None:
+        """The marginals of the beliefs that it planned in."""
+        if not self._acted.any():
+            return None
+        marginals = {i: self.beliefs[i].person_marginals() for i in np.flatnonzero(self._acted).tolist()}
+        unknown = np.full_like(next(iter(marginals.values())), np.nan)
+        return np.stack([marginals.get(i, unknown) for i in range(len(self._acted))])
 
     def _begin(self, count: int) -> None:
         self.beliefs, self.planners = [], []

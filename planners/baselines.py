@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from domains.core import Domain, ObservationPolicy, OraclePolicy
-from planners.agents import Situation
+from planners.agents import Situation, Unbelieving
 
 
-class RandomAgent:
+class RandomAgent(Unbelieving):
     """Acts uniformly at random, with a random stream per episode."""
 
     algorithm = "uniformly random"
@@ -30,7 +30,7 @@ class RandomAgent:
         return np.array([stream.integers(self.num_actions) for stream in self.streams], np.int64)
 
 
-class OracleFollower:
+class OracleFollower(Unbelieving):
     """First action of the shortest path to the person's pose on the full map; stays when there."""
 
     algorithm = "shortest path to the person"
@@ -41,7 +41,7 @@ class OracleFollower:
         return np.asarray(situation.env.expert_actions("follower"), np.int64)
 
 
-class OptimalAgent:
+class OptimalAgent(Unbelieving):
     """An exact optimum: with the full state, or for a belief from observations."""
 
     algorithm = "dynamic programming"
@@ -54,7 +54,7 @@ class OptimalAgent:
         return np.asarray(self.policy.actions(situation.env), np.int64)
 
 
-class LastSeenFollower:
+class LastSeenFollower(Unbelieving):
     """Walks to where it last saw the person, by what it sees: the domain's follower, as an agent."""
 
     algorithm = "shortest path to the last seen pose"

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from domains.core import OUTCOMES, STAY, Domain, DomainError, StepRecorder
-from planners.agents import Agent, Situation
+from planners.agents import Agent, Situation, says_something
 from planners.perception import Codec, Perception, Percepts
 from planners.shielding import ActionMask
 
@@ -100,8 +100,8 @@ def evaluate(
 
     Returns:
         Columns [episodes]: return, length, outcome (code), map_id, discounted_return, ms_per_decision (the first
-        two left out), and every metric of the domain (docs/metrics.md); those of beliefs only for players with
-        a perception.
+        two left out), and every metric of the domain (docs/metrics.md); those of beliefs only for agents that
+        have one of what the person sees.
     """
     maps = evaluation_maps(domain, variant, episodes)
     env: Any = domain.make("following", episodes, variant=variant, seed=seed, maps=maps, cycle=True)
@@ -115,10 +115,10 @@ def evaluate(
     factor = 1.0
     while active.any():
         started = time.perf_counter()
-        actions, percepts = player.decide(env, observation, active, last)
+        actions, _ = player.decide(env, observation, active, last)
         if length.max() >= UNTIMED:
             spent[active] += (time.perf_counter() - started) / active.sum()
-        beliefs = {} if percepts is None else _belief_metrics(domain, player, percepts, env.person_views())
+        beliefs = _belief_metrics(domain, player, env.person_views())
         observation, reward, terminated, truncated, infos = env.step(actions)
         recorder.step(actions, reward, infos, beliefs)
         discounted[active] += factor * np.asarray(reward)[active]
@@ -143,12 +143,21 @@ def evaluate(
     }
 
 
-def _belief_metrics(domain: Domain, player: Player, percepts: Percepts, person_views: np.ndarray) -> Columns:
-    """How well b~ agrees with what the person truly sees: arrays [B]."""
-    assert player.perception is not None
-    codec: Any = player.perception.codec
-    decoded = codec.views(percepts.shifted.argmax(axis=-1).astype(np.uint8))
-    return domain.belief_metrics(percepts.shifted, codec.codes(person_views), decoded, person_views)
+def _belief_metrics(domain: Domain, player: Player, person_views: np.ndarray) -> Columns:
+    """How well what the agent took the person to see agrees with what it truly sees: arrays [B].
+
+    A belief that says nothing is as far from the truth as it is, but has no most likely code: NaN there.
+    """
+    believed, codec = player.agent.person_belief(), player.codec
+    if believed is None or codec is None:
+        return {}
+    coder: Any = codec
+    nothing = np.where(np.isnan(believed).any(axis=(1, 2), keepdims=True), np.nan, 1.0 / believed.shape[-1])
+    speaks = says_something(believed)
+    held = np.where(speaks[:, None, None], believed, nothing)
+    decoded = coder.views(np.nan_to_num(held).argmax(axis=-1).astype(np.uint8))
+    found = domain.belief_metrics(held, coder.codes(person_views), decoded, person_views)
+    return {name: value if name == "kl" else np.where(speaks, value, np.nan) for name, value in found.items()}
 
 
 def outcome_names(codes: np.ndarray) -> list[str]:

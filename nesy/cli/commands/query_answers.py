@@ -152,7 +152,7 @@ def _why(knowledge: KnowledgeBase, options: Arguments) -> dict[str, Any]:
         "allowed": list(choice.allowed),
         "because": {name: list(rules) for name, rules in choice.because.items()},
         "code": list(choice.code),
-        "shifted": list(choice.shifted),
+        "shifted": None if choice.shifted is None else list(choice.shifted),
         "support": support,
     }
 

@@ -25,7 +25,7 @@ from domains.core import Domain, load_domain
 from nesy.errors import UserError
 from nesy.progress import SILENT, Progress
 from nesy.run_folder import RunFolder, atomic_path, read_json
-from planners.agents import Agent, BeliefAgent
+from planners.agents import Agent, BeliefAgent, says_something
 from planners.comparison.evaluation import evaluation_maps
 from planners.comparison.grid import EVALUATION_SEED, Cell, cell_path, grid
 from planners.comparison.model_store import ModelStore
@@ -162,11 +162,13 @@ def _play(
         person_views = env.person_views()
         actions, perceived = player.decide(env, observation, active, last)
         percepts = watching(observation, person_views) if perceived is None else perceived
+        believed = agent.person_belief()  # a reference has none: for pictures, Φ of what it saw
+        believed = percepts.shifted if believed is None else believed
         states = env.states()
         moments = {
             int(i): {
                 **_scene(states[i], maps),
-                **_senses(observation, percepts, person_views, watching, domain, int(i)),
+                **_senses(observation, percepts, believed, person_views, watching, domain, int(i)),
                 **_thoughts(agent, percepts, int(i)),
                 **_rules(shield, percepts, domain, int(i)),
                 "action": int(actions[i]),
@@ -233,16 +235,20 @@ def _scene(state: dict[str, Any], maps: dict[str, int]) -> dict[str, Any]:
 def _senses(
     observation: dict[str, np.ndarray],
     percepts: Percepts,
+    believed: np.ndarray,
     person_views: np.ndarray,
     perception: Perception,
     domain: Domain,
     i: int,
 ) -> dict[str, Any]:
-    """What is seen and believed: views as digits [vx][vy], beliefs as values or distributions per factor."""
+    """What is seen and believed: views as digits [vx][vy], beliefs as values or distributions per factor.
+
+    `believed` [B, N, K]: what the agent acted on, of what the person sees.
+    """
     configuration = int(percepts.configurations[i])
     codec: Any = perception.codec
-    shifted = percepts.shifted[i]
-    informed = bool((shifted.max(axis=1) > 1.0 / shifted.shape[1] + 1e-6).any())
+    shifted = believed[i]
+    informed = bool(says_something(believed)[i])
     decoded = codec.views(np.stack([percepts.beliefs[i], shifted]).argmax(axis=2).astype(np.uint8))
     seen = [int(part[0]) for part in domain.spec.geometry.decode(np.array([configuration]))]
     return {

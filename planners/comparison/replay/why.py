@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 from domains.core import Domain
 from nesy.errors import UserError
 from nesy.run_folder import RunFolder
-from planners.agents import DQNAgent, Situation
+from planners.agents import DQNAgent, Situation, says_something
 from planners.comparison.evaluation import permitted
 from planners.comparison.grid import Cell, grid
 from planners.comparison.players import restored_player
@@ -42,8 +42,8 @@ class Choice:
     """For each forbidden action the places of the rules that forbid it."""
     code: tuple[int, ...]
     """The robot's code."""
-    shifted: tuple[int, ...]
-    """The most probable value of each factor of what it takes the person to believe."""
+    shifted: tuple[int, ...] | None
+    """The most probable value of each factor of what it takes the person to see; None where it does not know."""
 
     @property
     def text(self) -> str:
@@ -57,7 +57,10 @@ class Choice:
         others = [self.values[name] for name in ranked if name != self.action and name in self.allowed]
         if others and self.action in self.values:
             lines.append(f"  ahead of the next allowed action by {self.values[self.action] - max(others):.3f}")
-        lines.append(f"  it sees the code {self.code} and takes the person to believe {self.shifted}")
+        person = "does not know what the person sees"
+        if self.shifted is not None:
+            person = f"takes the person to see {self.shifted}"
+        lines.append(f"  it sees the code {self.code} and {person}")
         return "\n".join(lines)
 
 
@@ -133,6 +136,8 @@ def explain_choice(
     action = int((actions if allowed is None else permitted(actions, allowed))[0])
     names = domain.spec.action_names
     values, visits = _values(player.agent, percepts, names, None if allowed is None else allowed[0])
+    believed = player.agent.person_belief()
+    known = believed is not None and says_something(believed)[0]
     because = {}
     if isinstance(player.mask, ShieldMask):
         because = player.mask.advise(percepts.codes[0], configuration).because
@@ -144,7 +149,7 @@ def explain_choice(
         allowed=tuple(n for a, n in enumerate(names) if allowed is None or allowed[0, a]),
         because=because,
         code=tuple(int(v) for v in percepts.codes[0]),
-        shifted=tuple(int(v) for v in percepts.shifted[0].argmax(axis=1)),
+        shifted=tuple(int(v) for v in believed[0].argmax(axis=1)) if known and believed is not None else None,
     )
 
 
