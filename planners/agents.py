@@ -160,7 +160,12 @@ class BeliefAgent:
             allowed = None if situation.allowed is None else situation.allowed[i]
             spent = shared + time.perf_counter() - begun
             actions[i], info = self.planners[i].plan(belief.states, allowed, spent)
-            self.infos[i] = info | {"effective": belief.effective, "resets": belief.resets}
+            expected = {
+                "influence": belief.influence().tolist(),
+                "effective": belief.effective,
+                "resets": belief.resets,
+            }
+            self.infos[i] = info | expected
         return actions
 
     def person_belief(self) -> np.ndarray | None:

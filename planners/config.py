@@ -10,8 +10,8 @@ from typing import Literal
 
 from nesy.config import check_ranges
 from nesy.errors import UserError
+from nesy.perspective.influence import INFLUENCE_MODES
 
-INFLUENCE_MODES = ("zero", "random", "egocentric", "perspective-shift", "perfect-information")
 INPUT_SETS = ("paper", "full")
 LEARNING_AGENTS = ("dqn",)
 TABLE_PLANNERS = ("pomdp", "search", "qmdp")

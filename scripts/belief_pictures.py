@@ -16,9 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from domains.core import load_domain
+from nesy.perspective.influence import INFLUENCE_MODES
 from nesy.run_folder import RunFolder, atomic_path
 from planners.agents import Situation
-from planners.config import INFLUENCE_MODES, SearchConfig
+from planners.config import SearchConfig
 from planners.perception import Perception
 from planners.person_following.agent import PlanningAgent
 from planners.person_following.ialm import IALM
@@ -59,7 +60,7 @@ def played(folder: Path, variant: str, number: int, prior: str, seed: int) -> li
     codec, model = SymbolicCodec(load_world_model(run.world_model)), IALM.load(run.ialm)
     env: Any = domain.make("following", 1, variant=variant, seed=seed, maps=domain.maps(variant)[0][[number]])
     observation, _ = env.reset(seed=seed)
-    agent = PlanningAgent("search", model, replace(SearchConfig(), particles=1000), domain.spec.geometry, seed)
+    agent = PlanningAgent("search", model, replace(SearchConfig(), particles=1000), domain.spec.geometry, seed, prior)
     perception = Perception(codec, prior, np.random.default_rng([seed, 1]))
     moments: list[Moment] = []
     active, last = np.ones(1, np.bool_), None

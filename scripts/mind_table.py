@@ -22,12 +22,12 @@ from scipy.stats import t as student
 
 from domains.core import load_domain
 from nesy.cli.configuration import load
+from nesy.perspective.influence import INFLUENCE_MODES
 from nesy.run_folder import RunFolder, atomic_path
 from planners.comparison.evaluation import Player
 from planners.comparison.grid import Cell
 from planners.comparison.model_store import ModelStore
 from planners.comparison.players import build_player, restored_player
-from planners.config import INFLUENCE_MODES
 
 SHIFT = "search, perspective-shift"
 _RESAMPLES = 4000

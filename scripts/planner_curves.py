@@ -21,10 +21,11 @@ from typing import Any
 import numpy as np
 
 from domains.core import Domain, load_domain
+from nesy.perspective.influence import INFLUENCE_MODES
 from nesy.run_folder import RunFolder, atomic_path
 from planners.agents import Situation
 from planners.comparison.evaluation import Player, evaluate
-from planners.config import INFLUENCE_MODES, SearchConfig
+from planners.config import SearchConfig
 from planners.perception import Perception
 from planners.person_following.agent import PlanningAgent
 from planners.person_following.ialm import IALM
@@ -84,7 +85,7 @@ def measure(
 
     codec, model = SymbolicCodec(load_world_model(run.world_model)), IALM.load(run.ialm)
     config = replace(SearchConfig(), simulations=budget)
-    agent = WatchedAgent("search", model, config, domain.spec.geometry, seed)
+    agent = WatchedAgent("search", model, config, domain.spec.geometry, seed, prior)
     perception = Perception(codec, prior, np.random.default_rng([seed, 1]))
     columns = evaluate(domain, variant, Player(agent, perception), episodes, seed)
     seen = np.array(agent.seen)

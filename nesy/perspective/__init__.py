@@ -6,7 +6,6 @@ import importlib
 from typing import Any
 
 _NAMES = (
-    "INFLUENCE_MODES",
     "PLANNERS",
     "InfluenceBelief",
     "PerspectiveShift",
@@ -16,12 +15,15 @@ _NAMES = (
     "shift",
 )
 
-__all__ = sorted(_NAMES)
+_OF_INFLUENCE = ("INFLUENCE_MODES", "InfluencePrior")
+
+__all__ = sorted((*_NAMES, *_OF_INFLUENCE))
 
 
 def __getattr__(name: str) -> Any:
     """Names are handed on when they are first asked for: torch-free and numba-free imports stay light."""
-    if name in _NAMES:
-        value = globals()[name] = getattr(importlib.import_module("nesy.perspective.operator"), name)
+    if name in (*_NAMES, *_OF_INFLUENCE):
+        module = "nesy.perspective.operator" if name in _NAMES else "nesy.perspective.influence"
+        value = globals()[name] = getattr(importlib.import_module(module), name)
         return value
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -23,12 +23,12 @@ from domains.core import UNSEEN
 from nesy.checked_arrays import distributions, whole_numbers
 from nesy.errors import UserError
 from nesy.perspective.imagined_beliefs import Believed, JointRoll, roll_factored
+from nesy.perspective.influence import InfluencePrior
 from nesy.perspective.shortest_paths import Levels, Trees, levels, plan, poses_along
 from nesy.world_model.codec import code_keys
 from nesy.world_model.rolling import Rollout
 from nesy.world_model.successors import Factored, PackedModel, pack
 
-INFLUENCE_MODES = ("zero", "random", "egocentric", "perspective-shift", "perfect-information")
 PLANNERS = ("table", "network")
 BLOCK = 1024
 """Beliefs whose trees of walks are gone through at once, to bound the memory that their distributions take."""
@@ -319,12 +319,11 @@ def imagine(belief: np.ndarray, configuration: int, model: ShiftModel, *, planne
 
 
 class InfluenceBelief:
-    """What the planner takes the other agent to believe, under an influence mode.
+    """b~ over the other agent's code, without memory, under an influence mode (the table in nesy.perspective.influence).
 
-    `zero`: nothing (uniform). `random`: a code drawn anew each time. `egocentric`: what the own agent believes.
-    `perspective-shift`: Φ. `perfect-information`: the code of the other agent's true view. Under every mode the
-    belief is uniform while the other agent is unseen, and where Φ finds no way to it: modes differ in what they make
-    of an agent in view, not in when they have something to say.
+    `zero` is uniform, and `random` a code of which each factor is drawn evenly; `perspective-shift` is Φ of the own
+    belief, and `egocentric` the own belief. Under every mode b~ is uniform while the other agent is unseen, and where Φ
+    finds no way to it: modes differ in what they make of an agent in view, not in when they have something to say.
     """
 
     def __init__(self, mode: str, codec: BeliefCodec, rng: np.random.Generator, *, even_unseen: bool = False) -> None:
@@ -339,9 +338,7 @@ class InfluenceBelief:
         Raises:
             UserError: an unknown mode.
         """
-        if mode not in INFLUENCE_MODES:
-            raise UserError(f"unknown influence mode '{mode}'; known: {', '.join(INFLUENCE_MODES)}")
-        self.mode, self.codec, self.rng, self.even_unseen = mode, codec, rng, even_unseen
+        self.prior, self.codec, self.even_unseen = InfluencePrior(mode, rng), codec, even_unseen
         self._shift: PerspectiveShift | None = None
         if mode == "perspective-shift":
             self._shift = PerspectiveShift(codec, "network" if codec.packed() is None else "table")
@@ -357,17 +354,14 @@ class InfluenceBelief:
         if self._shift is not None:
             return self._shift(beliefs, configurations).beliefs
         nothing = np.full_like(beliefs, 1.0 / num_values)
-        if self.mode == "egocentric":
+        if self.prior.mode == "egocentric":
             believed = beliefs
-        elif self.mode == "perfect-information":
+        elif self.prior.mode == "perfect-information":
             if person_views is None:
                 raise UserError("influence mode 'perfect-information' needs the other agent's true views")
             believed = np.asarray(self.codec.beliefs(person_views), dtype=np.float32)
-        elif self.mode == "random":
-            codes = self.rng.integers(0, num_values, beliefs.shape[:-1])
-            believed = np.eye(num_values, dtype=np.float32)[codes]
         else:
-            return nothing
+            believed = self.prior.codes(beliefs.shape[:-1], num_values)
         if self.even_unseen:
             return believed.copy()
         return np.where((np.asarray(configurations) > 0)[:, None, None], believed, nothing)

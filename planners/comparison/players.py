@@ -143,7 +143,7 @@ def _planner(cell: Cell, store: ModelStore, domain: Domain, config: CompareConfi
 
         model, _ = constrain_influence(model, [Path(rule) for rule in config.rules], codec, domain)
     if cell.agent != "structured":
-        return PlanningAgent(cell.agent, model, search, geometry, seed)
+        return PlanningAgent(cell.agent, model, search, geometry, seed, cell.influence)
     from planners.person_following.structured.drawn_maps.mapped_agent import MappedAgent
     from planners.person_following.structured.known_maps.mind_agent import MindAgent
     from planners.person_following.structured.known_maps.minds import MindModel

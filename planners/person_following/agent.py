@@ -19,9 +19,17 @@ class PlanningAgent(BeliefAgent):
 
     model = "2DBN and influence prior (learned local model)"
 
-    def __init__(self, kind: str, model: IALM, config: SearchConfig, geometry: ViewGeometry, seed: int) -> None:
+    def __init__(
+        self,
+        kind: str,
+        model: IALM,
+        config: SearchConfig,
+        geometry: ViewGeometry,
+        seed: int,
+        influence: str = "perspective-shift",
+    ) -> None:
         super().__init__(geometry, seed)
-        self.kind, self.local_model, self.config = kind, model, config
+        self.kind, self.local_model, self.config, self.influence = kind, model, config, influence
         self.algorithm = ALGORITHMS[kind]
         self.compiled = compile_model(model)
 
@@ -30,7 +38,7 @@ class PlanningAgent(BeliefAgent):
         return situation.percepts.shifted
 
     def _belief(self, rng: np.random.Generator) -> ParticleBelief:
-        return ParticleBelief(self.local_model, self.compiled, self.config.particles, rng)
+        return ParticleBelief(self.local_model, self.compiled, self.config.particles, rng, mode=self.influence)
 
     def _planner(self, rng: np.random.Generator) -> Planner:
         if self.kind == "pomdp":

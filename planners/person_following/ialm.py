@@ -12,8 +12,8 @@
         waiting', lost', outcome      tables
     R   table over (c', outcome, ...)
 
-The influence I(u | l) = sum_y pi(u | y) b~(y) mixes the learned table pi with a prior b~ over y, the
-perspective-shifted belief; an influence mode is a way to replace that prior (nesy.perspective.operator).
+The influence I(u | l) = sum_y pi(u | y) b~(y) mixes the learned table pi with what is believed of y
+(nesy.perspective.influence); `beliefs` keeps b~ as particles.
 
 Every table is a `DecisionTable` with counts, learned from logged transitions. Nothing about the task's rules
 is written down here: not what blocks a move, when the person waits, how far is too far, or what is rewarded.
@@ -162,35 +162,6 @@ class IALM:
         """The learned tables in flat arrays."""
         return pack([self.tables[name] for name in TABLES])
 
-    def influence(self, prior: np.ndarray) -> np.ndarray:
-        """I(u | l) = sum_y pi(u | y) b~(y), exactly, given that the person does not wait.
-
-        Args:
-            prior: float [N, K], b~, rows sum to 1.
-
-        Returns:
-            float64 [3]: probability of left, right, forward.
-        """
-        assert prior.shape == (self.num_factors, self.num_values), prior.shape
-        table = self.tables["influence"]
-        estimates = table.estimates()
-        base = 2 * self.num_factors
-
-        def mixture(node: int, belief: np.ndarray) -> np.ndarray:
-            mass = belief.sum(axis=1).prod()
-            if mass <= 0:
-                return np.zeros(estimates.shape[1])
-            if table.slot[node] < 0:
-                return mass * estimates[node]
-            factor, value = int(table.slot[node]) - base, int(table.value[node])
-            met = np.arange(self.num_values) <= value if table.ordered[node] else np.arange(self.num_values) == value
-            yes, no = belief.copy(), belief.copy()
-            yes[factor, ~met] = 0
-            no[factor, met] = 0
-            return mixture(int(table.yes[node]), yes) + mixture(int(table.no[node]), no)
-
-        return mixture(0, np.asarray(prior, np.float64))
-
     def influence_of(self, codes: np.ndarray) -> np.ndarray:
         """pi(u | y) for person's codes uint8 [n, N] -> float64 [n, 3]."""
         table = self.tables["influence"]
@@ -217,11 +188,11 @@ class IALM:
         """
         floored = (1 - floor) * np.asarray(prior, np.float64) + floor / self.num_values
         logarithms = _EVIDENCE * np.log(floored)[np.arange(self.num_factors), self.known_codes].sum(axis=1)
-        chances = np.exp(logarithms - logarithms.max()) * self._person_chances
+        chances = np.exp(logarithms - logarithms.max()) * self.person_chances
         return np.asarray(chances / chances.sum())
 
     @cached_property
-    def _person_chances(self) -> np.ndarray:
+    def person_chances(self) -> np.ndarray:
         """P(y) before anything is known of the person; `_ELSEWHERE` of it spread over all known codes."""
         counts = self.person_counts
         share = counts / counts.sum() if counts.sum() > 0 else np.full(len(counts), 1.0 / len(counts))

@@ -168,6 +168,7 @@ def finish(model: Model, v: np.ndarray, after: np.ndarray, rng: np.ndarray) -> t
 def explain_step(
     model: Model,
     state: np.ndarray,
+    moves: np.ndarray,
     action: int,
     then: np.ndarray,
     seen: np.ndarray,
@@ -183,6 +184,7 @@ def explain_step(
     Args:
         model: the packed IALM.
         state: int16 [2N + 5], the particle before the step.
+        moves: float64 [U], pi(u | y) of the particle.
         action: the robot's action.
         then: int16 [N], the robot's next code, observed.
         seen: int16 [3], the person's next pose (shifted), or all -1 if the person was not in view.
@@ -221,7 +223,7 @@ def explain_step(
                 continue
             weight = share * waits
             if person != WAIT:
-                weight = share * (1.0 - waits) * chance(model.tables, ialm.INFLUENCE, v, person)
+                weight = share * (1.0 - waits) * moves[person]
             visible = 1 if seen[2] >= 0 else 0
             v[b + ialm.IS_VISIBLE] = visible
             weight *= chance(model.tables, ialm.VISIBLE, v, visible)

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from domains.core import ViewGeometry
 from nesy.errors import UserError
+from nesy.perspective.influence import INFLUENCE_MODES
 from nesy.perspective.operator import (
-    INFLUENCE_MODES,
     InfluenceBelief,
     PerspectiveShift,
     TableModel,

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from nesy.errors import UserError
+from nesy.perspective.influence import INFLUENCE_MODES
 from nesy.run_folder import RunFolder
 from planners.comparison.model_store import ModelStore
 from planners.person_following import ialm, kernels
@@ -75,13 +76,59 @@ def test_sampled_steps_have_the_distribution_that_the_tables_say(action: int) ->
         assert counts[key] / draws == pytest.approx(p, abs=5 * np.sqrt(p * (1 - p) / draws) + 1e-4)
 
 
-def test_influence_is_the_mixture_over_the_prior() -> None:
+def _believing(model: IALM, mode: str, prior: np.ndarray, particles: int = 2000) -> ParticleBelief:
+    belief = ParticleBelief(model, kernels.compile_model(model), particles, np.random.default_rng(0), mode=mode)
+    belief.reset(np.array([0, 1]), np.array([0, 0, 3]), prior)
+    return belief
+
+
+def test_the_filter_predicts_by_the_influence() -> None:
+    """P(the person goes ahead, x' | l, stay) has I(forward | l) as its factor, and no other share of the belief."""
+    model, action, then = small_ialm(2), 3, np.array([1, 1])
+    belief = _believing(model, "perspective-shift", np.array([[0.3, 0.7], [0.9, 0.1]]))
+    codes = belief.states[:, N : 2 * N]
+    brute = sum(model.influence_of(code[None].astype(np.uint8))[0] * (codes == code).all(1).mean() for code in CODES)
+    assert np.allclose(belief.influence(), brute)
+    waits = _chance(model, "waits", _variables(model, then, then, then))[1]
+    variables = _variables(model, then, then, then, next_ahead=3)
+    sight = _chance(model, "visible", variables)[1] * _chance(model, "outcome", variables)[0]
+    wanted = np.exp(model.dbn.log_prob(np.array([0, 1]), action, then)) * (1 - waits) * brute[2] * sight
+    found = np.exp(belief.update(action, then, np.array([0, 1, 3]), np.full((N, K), 0.5)))
+    assert found == pytest.approx(float(wanted))
+
+
+@pytest.mark.parametrize("mode", INFLUENCE_MODES)
+def test_a_search_begins_with_the_influence(mode: str) -> None:
+    """What the person does in the first step of walks from the belief's particles is I(u | l)."""
     model = small_ialm(2)
-    prior = np.array([[0.3, 0.7], [0.9, 0.1]])
-    brute = sum(
-        prior[0, code[0]] * prior[1, code[1]] * model.influence_of(code[None].astype(np.uint8))[0] for code in CODES
-    )
-    assert np.allclose(model.influence(prior), brute)
+    belief = _believing(model, mode, np.eye(K)[[1, 0]])
+    compiled, bits = kernels.compile_model(model), stream(np.random.default_rng(1))
+    after, v = np.zeros(model.state_size, np.int16), np.zeros(3 * N + len(SCALARS), np.int16)
+    counts = np.zeros(4)
+    for state in np.tile(belief.states, (10, 1)):
+        kernels.step(compiled, state, 3, after, v, bits)
+        counts[v[3 * N + ialm.PERSON]] += 1
+    assert counts[:3] / counts[:3].sum() == pytest.approx(belief.influence(), abs=0.02)
+
+
+def test_modes_put_other_codes_in_the_persons_place() -> None:
+    model = replace(small_ialm(2), person_counts=np.array([1.0, 2.0, 3.0, 4.0]))
+    told = np.eye(K)[[1, 0]]
+    shares: dict[str, list[np.ndarray]] = {}
+    for mode in INFLUENCE_MODES:
+        belief = _believing(model, mode, told)
+        rows = []
+        for _ in range(12):
+            rows.append(np.array([(belief.states[:, N : 2 * N] == code).all(axis=1).mean() for code in CODES]))
+            belief.update(3, np.array([0, 1]), np.array([0, 0, 3]), told)
+        shares[mode] = rows
+    for row in (*shares["egocentric"], *shares["perfect-information"]):
+        assert row.tolist() == [0.0, 0.0, 1.0, 0.0]
+    for row in shares["zero"]:  # whatever it is told and sees
+        assert row == pytest.approx(model.person_chances, abs=0.04)
+    drawn = [int(row.argmax()) for row in shares["random"]]
+    assert all(row.max() == 1.0 for row in shares["random"]) and len(set(drawn)) > 1
+    assert 0.5 < shares["perspective-shift"][-1][2] < 1.0
 
 
 def test_next_local_state_given_the_influence() -> None:
@@ -94,7 +141,7 @@ def test_next_local_state_given_the_influence() -> None:
         weight = prior[0, y[0]] * prior[1, y[1]]
         for key, p in _brute_force(model, np.array([*x, *y, 2, 2, 3, 0, 0]), action).items():
             by_codes[key[: N + 3]] = by_codes.get(key[: N + 3], 0.0) + weight * p
-    influence = model.influence(prior)
+    influence = sum(prior[0, y[0]] * prior[1, y[1]] * model.influence_of(y[None].astype(np.uint8))[0] for y in CODES)
     by_influence: dict[tuple[int, ...], float] = {}
     moved = _chance(model, "moved", _variables(model, x, x, x))
     for motion, share in ((action, moved[1]), (3, moved[0])):

@@ -15,6 +15,7 @@ from nesy.run_folder import RunFolder
 from planners.comparison.compare import compare
 from planners.config import CompareConfig, SearchConfig
 from planners.person_following import ialm, kernels
+from planners.person_following.beliefs import ParticleBelief
 from planners.person_following.ialm import SCALARS
 from planners.person_following.influence_rules import constrain_influence
 from planners.search.random_bits import stream
@@ -56,10 +57,10 @@ def test_excluded_moves_get_no_probability_and_the_others_are_renormalised(seed:
     assert change is not None and (change.codes, change.constrained, change.conflicts) == (4, 2, 0)
     assert change.removed == pytest.approx((old * (1 - possible)).sum(axis=1).mean())
     # a belief over the person's code mixes these rows
-    rng = np.random.default_rng(seed)
-    belief = rng.dirichlet(np.ones(2), size=2)
-    weights = belief[0][codes[:, 0]] * belief[1][codes[:, 1]]
-    np.testing.assert_allclose(after.influence(belief), weights @ after.influence_of(codes), atol=1e-12)
+    belief = ParticleBelief(after, kernels.compile_model(after), 50, np.random.default_rng(seed))
+    belief.reset(np.array([0, 1]), np.array([0, 0, 3]), np.full((2, 2), 0.5))
+    mixed = after.influence_of(belief.states[:, N : 2 * N]).mean(axis=0)
+    np.testing.assert_allclose(belief.influence(), mixed, atol=1e-12)
 
 
 def test_kernels_keep_to_the_rules() -> None:

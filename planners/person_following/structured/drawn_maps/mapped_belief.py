@@ -3,12 +3,11 @@
     b(p, lost)   a weight each; the robot's own pose and the map follow from what it did and saw
 
 A step draws the new view into the map, moves every weight on by I(u | l) and weighs it by whether the person was seen
-there or not, and by that the episode went on. An influence mode says what the person is taken to see (y), and with it
+there or not, and by that the episode went on. An influence mode (nesy.perspective.influence) says what the person is taken to see:
 
     perspective-shift     what the map says around the person: seen from its place, remembered by the robot
     egocentric            what the map says around the robot
-    zero                  nothing that counts: I(u) as it is on average
-    random                what some person saw somewhere, drawn anew each step
+    zero, random          the base: what persons saw, as often as they did
     perfect-information   what the person truly sees is drawn into the map
 
 If nothing explains what was seen, the belief starts afresh: where persons start, or anywhere; counted in `resets`.
@@ -23,6 +22,7 @@ import numpy as np
 
 from domains.core import EMPTY, STAY, UNSEEN, WALL
 from nesy.compiled import njit
+from nesy.perspective.influence import InfluencePrior, influence
 from planners.person_following.motion import NUM_HEADINGS, NUM_MOVES
 from planners.person_following.structured.drawn_maps.mapped_model import AROUND, MAX_WALK, MappedModel
 from planners.person_following.structured.drawn_maps.mapped_ways import (
@@ -76,12 +76,10 @@ class MappedBelief:
             rng: for `random`.
             possible: which moves rules leave to persons with codes uint8 [n, N]: bool [n, moves]; None without rules.
         """
-        self.model, self.tables, self.codec, self.mode, self.rng = model, tables, codec, mode, rng
+        self.model, self.tables, self.codec, self.prior = model, tables, codec, InfluencePrior(mode, rng)
         self.possible = possible
         self.resets = 0
-        self._marginal = model.person.moments[0] / model.person.moments[0].sum()
-        rows = np.flatnonzero(model.person.slot < 0)
-        self._rows, self._often = rows, np.cumsum(model.person.moments[rows].sum(1)) / model.person.moments[0].sum()
+        self._rows = np.flatnonzero(model.person.slot < 0)
 
     def reset(self, view: np.ndarray, pose: np.ndarray | None, told: np.ndarray | None = None) -> None:
         """Start an episode.
@@ -126,7 +124,7 @@ class MappedBelief:
 
     def influence(self) -> np.ndarray:
         """I(u | l) = sum over p of pi(u | p) b(p): float64 [4]."""
-        return np.asarray(self.weights.sum(1) @ self.chances)
+        return influence(self.chances, self.weights.sum(1))
 
     @property
     def window(self) -> int:
@@ -222,13 +220,12 @@ class MappedBelief:
     def _expect(self) -> None:
         """I(u | p) for every pose, as the influence mode has it."""
         count = len(self.weights)
-        if self.mode == "zero":
-            self.chances = np.tile(self._marginal, (count, 1))
-        elif self.mode == "random":
-            row = self._rows[min(int(np.searchsorted(self._often, self.rng.random())), len(self._rows) - 1)]
-            self.chances = np.tile(self.tables.policy[row], (count, 1))
+        if self.prior.blind:
+            self.prior.renew()
+            often = self.prior.base(self.model.person.moments[self._rows].sum(1))
+            self.chances = np.tile(influence(self.tables.policy[self._rows], often), (count, 1))
         else:
-            seen_from = self.robot if self.mode == "egocentric" else -1
+            seen_from = self.robot if self.prior.mode == "egocentric" else -1
             self.chances = expected_moves(self.tables, self.ground, seen_from)
         if self.possible is not None:
             poses = np.flatnonzero(np.repeat((self.ground.filled != WALL).ravel(), NUM_HEADINGS))

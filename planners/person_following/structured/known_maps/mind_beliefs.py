@@ -3,11 +3,11 @@
     b(s, q, p, z, g, gone, n, lost)   a weight each; the clock is known
 
 A step carries every hypothesis on (ways) and weighs it by what was seen: the robot's code, the person's pose
-or its absence from view, and that the episode went on. An influence mode says what then becomes of (z, g), what the
-person heads for and what is so:
+or its absence from view, and that the episode went on. An influence mode (nesy.perspective.influence) says what then
+becomes of (z, g), what the person heads for and what is so:
 
     perspective-shift     kept as the person's moves and its imagined views over time leave it
-    zero, random          never learned from: all candidates alike, or one drawn anew each step
+    zero, random          the base: all candidates alike
     egocentric            the person knows of a moved goal what the robot knows (another `Ways`)
     perfect-information   the truth
 
@@ -21,6 +21,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from domains.core import FORWARD, STAY
+from nesy.perspective.influence import InfluencePrior, influence
 from planners.person_following.structured.frames import AHEAD
 from planners.person_following.structured.known_maps.mind_checks import PERIOD
 from planners.person_following.structured.known_maps.mind_walk import MindParticles
@@ -43,7 +44,7 @@ class MindBelief:
     """
 
     def __init__(self, ways: Ways, mode: str, rng: np.random.Generator) -> None:
-        self.ways, self.model, self.mode, self.rng = ways, ways.model, mode, rng
+        self.ways, self.model, self.prior = ways, ways.model, InfluencePrior(mode, rng)
         self.weights: dict[_Hypothesis, float] = {}
         self.resets = 0
         noise = max(self.model.code_noise, _LEAST_NOISE)
@@ -126,10 +127,9 @@ class MindBelief:
 
     def influence(self) -> np.ndarray:
         """I(u | l) = sum over (p, z) of pi(u | p, z) b(p, z): float64 [4]."""
-        out = np.zeros(4)
-        for (node, _, _), weight in self.weights.items():
-            out += weight * self.ways.policy[node[SCENE], node[HEADS_FOR], node[PLACE]]
-        return out / out.sum()
+        nodes = np.array([node for node, _, _ in self.weights])
+        policy = self.ways.policy[nodes[:, SCENE], nodes[:, HEADS_FOR], nodes[:, PLACE]]
+        return influence(policy, np.array(list(self.weights.values())))
 
     @property
     def window(self) -> int:
@@ -205,20 +205,20 @@ class MindBelief:
 
     def _mind(self, truth: Truth | None) -> None:
         """Put what the influence mode has in the person's mind."""
-        if self.mode in ("perspective-shift", "egocentric"):
+        if self.prior.mode in ("perspective-shift", "egocentric"):
             return
         weights: dict[_Hypothesis, float] = {}
-        draw = float(self.rng.random())
+        self.prior.renew()
         for (node, q, lost), weight in self.weights.items():
-            for other, share in self._minds(node, q, draw, truth):
+            for other, share in self._minds(node, q, truth):
                 weights[other, q, lost] = weights.get((other, q, lost), 0.0) + weight * share
         if weights:
             total = sum(weights.values())
             self.weights = {key: weight / total for key, weight in weights.items()}
 
-    def _minds(self, node: Node, q: int, draw: float, truth: Truth | None) -> Iterable[tuple[Node, float]]:
+    def _minds(self, node: Node, q: int, truth: Truth | None) -> Iterable[tuple[Node, float]]:
         s, t, p, _, _, gone, standing = node
-        if self.mode == "perfect-information" and truth is not None:
+        if self.prior.mode == "perfect-information" and truth is not None:
             cells = [self.model.scenes.cell_at(s, q, place) for place in truth]
             which = [
                 self.model.scenes.goals[s].tolist().index(c) if c in self.model.scenes.goals[s] else -1 for c in cells
@@ -228,7 +228,5 @@ class MindBelief:
                 return [((s, t, p, which[0], which[1], left, standing), 1.0)]
             return [(node, 1e-9)]
         candidates = self.ways.candidates(s, gone)
-        if self.mode == "random":
-            k = candidates[int(draw * len(candidates))]
-            return [((s, t, p, k, k, gone, standing), 1.0)]
-        return [((s, t, p, k, k, gone, standing), 1.0 / len(candidates)) for k in candidates]
+        shares = zip(candidates, self.prior.base(np.ones(len(candidates))).tolist(), strict=True)
+        return [((s, t, p, k, k, gone, standing), share) for k, share in shares if share > 0]
