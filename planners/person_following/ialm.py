@@ -4,7 +4,7 @@
         c = (side, ahead, heading), the person's pose relative to the robot, also where it is out of view
     A   the robot's actions
     O   the robot's next code x', and c' if the person is in view
-    T   m  ~ moved(x, c)              whether `forward` moves the robot; the effective motion m
+    T   m  ~ moved(a, x, c)           whether the action moves the robot; the effective motion m
         x' ~ 2DBN(x, m)
         u  ~ I(u | l)                 waits(c after m, x', waiting), otherwise pi(u | y)
         c' = motion of c under (m, u)

@@ -66,7 +66,7 @@ def learn_ialm(
     def column(scalar: int) -> np.ndarray:
         return variables[:, 3 * n + scalar]
 
-    forward = column(ialm.ACTION) == FORWARD
+    acted = column(ialm.ACTION) != STAY
     waited = column(ialm.PERSON) == WAIT
     followed, next_waiting, next_lost = _next_counters(following)
     outcome = column(ialm.THE_OUTCOME).astype(np.int64)
@@ -79,7 +79,7 @@ def learn_ialm(
     estimated = lost_table.estimates()[lost_table.locate(variables[ended])].argmax(axis=1)
     variables[ended, 3 * n + ialm.NEXT_LOST_COUNT] = estimated
     tables = {
-        "moved": _learn_moved(codec, crossing, variables[forward], moved[forward], parents("x", "c")),
+        "moved": _learn_moved(codec, crossing, variables[acted], moved[acted], parents("action", "x", "c")),
         "waits": learn_distribution(variables, parents("mid", "next_x", "waiting"), waited.astype(np.int64), 2),
         "influence": _learn_influence(dbn, codec, experience, following, parents("y")),
         "next_waiting": learn_distribution(
@@ -161,7 +161,7 @@ def _variables(
     out[:, n : 2 * n] = codec.codes(experience.next_view)
     out[:, 2 * n : 3 * n] = codec.codes(experience.person_view)
     action = experience.action.astype(np.int64)
-    effective = np.where((action == FORWARD) & ~moved, STAY, action)
+    effective = np.where(moved, action, STAY)
     middle = motion.apply(experience.relative_pose, effective, np.full(len(action), WAIT))
     outcome = np.where(experience.outcome == TIMEOUT, 0, experience.outcome)
     columns: dict[int, np.ndarray] = {
@@ -200,7 +200,7 @@ def _next_counters(experience: Experience) -> tuple[np.ndarray, np.ndarray, np.n
 def _learn_moved(
     codec: Codec, crossing: Experience, variables: np.ndarray, moved: np.ndarray, parents: Parents
 ) -> DecisionTable:
-    """P(moved | x, c) from following, where c shows it, and from crossing, where the view does.
+    """P(moved | action, x, c) from following, where c shows it, and from crossing, where the view does.
 
     A view may look the same after a move, so one unchanged view proves nothing; a code from which `forward` never
     changed the view is one from which it does not move. Nobody is met in crossing: c is set to the farthest pose.
@@ -214,6 +214,7 @@ def _learn_moved(
     ever = np.bincount(group.reshape(-1), changed) > 0
     alone = np.zeros((len(distinct), variables.shape[1]), np.int32)
     alone[:, : codes.shape[1]] = distinct
+    alone[:, 3 * codes.shape[1] + ialm.ACTION] = FORWARD
     return learn_distribution(
         np.concatenate([variables, alone]),
         parents,

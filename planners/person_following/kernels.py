@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from domains.core import FORWARD, STAY
+from domains.core import STAY
 from nesy.compiled import njit
 from nesy.dbn.inference.kernels import Packed
 from planners.models.tables import PackedTables, locate
@@ -130,7 +130,7 @@ def step(
     b = 3 * n
     load_state(model, state, action, v)
     motion = action
-    if action == FORWARD and draw(model.tables, ialm.MOVED, v, rng) == 0:
+    if action != STAY and draw(model.tables, ialm.MOVED, v, rng) == 0:
         motion = STAY
     v[b + ialm.MOTION] = motion
     next_code(model.codes, v, 0, motion, v, n, rng)
@@ -202,7 +202,7 @@ def explain_step(
         v[n + i] = then[i]
     weights = np.zeros(8)
     total = 0.0
-    moved = chance(model.tables, ialm.MOVED, v, 1) if action == FORWARD else 1.0
+    moved = chance(model.tables, ialm.MOVED, v, 1) if action != STAY else 1.0
     for stays in range(2):
         motion = STAY if stays == 1 else action
         share = 1.0 - moved if stays == 1 else moved

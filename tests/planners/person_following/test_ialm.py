@@ -40,7 +40,7 @@ def _brute_force(model: IALM, state: np.ndarray, action: int) -> dict[tuple[int,
     pose = state[2 * N : 2 * N + 3].astype(int) - np.array([2, 2, 0])
     out: dict[tuple[int, ...], float] = {}
     blank = np.zeros(N, int)
-    moved = _chance(model, "moved", _variables(model, x, y, blank)) if action == 2 else np.array([0.0, 1.0])
+    moved = _chance(model, "moved", _variables(model, x, y, blank)) if action != 3 else np.array([0.0, 1.0])
     for motion, share in ((action, moved[1]), (3, moved[0])):
         for then in CODES:
             here = share * np.exp(model.dbn.log_prob(x, motion, then))
