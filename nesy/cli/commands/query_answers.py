@@ -153,6 +153,7 @@ def _why(knowledge: KnowledgeBase, options: Arguments) -> dict[str, Any]:
         "because": {name: list(rules) for name, rules in choice.because.items()},
         "code": list(choice.code),
         "shifted": None if choice.shifted is None else list(choice.shifted),
+        "influence": choice.influence,
         "support": support,
     }
 

@@ -275,6 +275,7 @@ def _thoughts(agent: Agent, percepts: Percepts, i: int) -> dict[str, Any]:
         "values": [round(float(value), 3) for value in info["values"]],
         "visits": [int(count) for count in info["visits"]],
         "simulations": int(info["simulations"]),
+        "influence": [round(float(share), 3) for share in info["influence"]],
         "tree": _tree_of(planner, belief.window),
         "where": _places(belief.pose_marginal(), belief.window),
         "person": _distributions(belief.person_marginals()),

@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 from domains.core import Domain
 from nesy.errors import UserError
 from nesy.run_folder import RunFolder
-from planners.agents import DQNAgent, Situation, says_something
+from planners.agents import BeliefAgent, DQNAgent, Situation, says_something
 from planners.comparison.evaluation import permitted
 from planners.comparison.grid import Cell, grid
 from planners.comparison.players import restored_player
@@ -44,6 +44,8 @@ class Choice:
     """The robot's code."""
     shifted: tuple[int, ...] | None
     """The most probable value of each factor of what it takes the person to see; None where it does not know."""
+    influence: dict[str, float]
+    """I(u | l): how probably the person does what next, unless it waits; empty for a learner."""
 
     @property
     def text(self) -> str:
@@ -61,6 +63,9 @@ class Choice:
         if self.shifted is not None:
             person = f"takes the person to see {self.shifted}"
         lines.append(f"  it sees the code {self.code} and {person}")
+        if self.influence:
+            moves = ", ".join(f"{name} {share:.2f}" for name, share in self.influence.items())
+            lines.append(f"  unless the person waits it expects of it: {moves}")
         return "\n".join(lines)
 
 
@@ -150,7 +155,14 @@ def explain_choice(
         because=because,
         code=tuple(int(v) for v in percepts.codes[0]),
         shifted=tuple(int(v) for v in believed[0].argmax(axis=1)) if known and believed is not None else None,
+        influence=_influence(player.agent, names),
     )
+
+
+def _influence(agent: Any, names: tuple[str, ...]) -> dict[str, float]:
+    """What a planner expected the person to do when it acted."""
+    expected = agent.infos[0]["influence"] if isinstance(agent, BeliefAgent) else []
+    return {name: float(share) for name, share in zip(names, expected, strict=False)}
 
 
 def _values(

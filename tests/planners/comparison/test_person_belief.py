@@ -112,3 +112,5 @@ def test_explanations_say_what_the_agent_believed_or_that_it_does_not_know(tiny_
         choice = explain_choice(run, DOMAIN, config, cell, view, configuration_seen, 0)
         assert (choice.shifted is not None) == knows
         assert ("does not know what the person sees" in choice.text) == (not knows)
+        assert ("it expects of it" in choice.text) == (agent == "search")
+        assert sum(choice.influence.values()) == pytest.approx(float(agent == "search"))
