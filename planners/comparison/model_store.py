@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from planners.person_following.structured.drawn_maps.mapped_model import MappedModel
     from planners.person_following.structured.known_maps.minds import MindModel
 
-TABLES_VERSION = 2
+TABLES_VERSION = 3
 """Of the local model (planners.person_following.ialm_learning)."""
 STRUCTURED_VERSION = 3
 """Of the hand-structured models (planners.person_following.structured)."""

@@ -91,7 +91,7 @@ TIMEOUT = 5
 """An ending by the clock; the model has no clock, so such a step counts as an ordinary one."""
 
 
-FORMAT, VERSION = "nesy-ialm", 2
+FORMAT, VERSION = "nesy-ialm", 3
 _EVIDENCE = 0.5  # power of the product of what is believed of a code's factors: they come together, as one view
 _ELSEWHERE = 0.1  # chance that a person has a code as any robot has it, not as persons were seen to
 _DAMAGE = (OSError, ValueError, LookupError, TypeError, AttributeError, NotImplementedError, EOFError,
@@ -254,6 +254,9 @@ class IALM:
         description = read_json(folder / "model.json")
         if not isinstance(description, dict) or description.get("format") != FORMAT:
             raise UserError(f"{folder / 'model.json'}: not an influence-augmented local model")
+        if description.get("version") != VERSION:
+            found = f"version {description.get('version')}, this program has {VERSION}"
+            raise UserError(f"{folder / 'model.json'}: {found}; learn the tables again (nesy compare)")
         dbn = TwoSliceDBN.load(folder.parent / "dbn") if dbn is None else dbn
         if (description.get("num_factors"), description.get("num_values")) != (dbn.num_factors, dbn.num_values):
             raise UserError(f"{folder}: its tables were learned for another 2DBN; learn them again (nesy compare)")

@@ -269,6 +269,16 @@ def test_a_run_holds_models_of_several_variants(tmp_path: Path) -> None:
         assert ModelStore(run).local_model(variant).provenance == {"variant": variant}
 
 
+def test_tables_of_another_version_are_refused(tmp_path: Path) -> None:
+    """In version 2 `moved` was of `forward` alone, and would say of turns what it says of `forward`."""
+    model = small_ialm(8)
+    model.save(tmp_path / "ialm")
+    path = tmp_path / "ialm" / "model.json"
+    path.write_text(path.read_text().replace('"version": 3', '"version": 2'))
+    with pytest.raises(UserError, match="version 2, this program has 3"):
+        IALM.load(tmp_path / "ialm", model.dbn)
+
+
 def test_damaged_files_are_named(tmp_path: Path) -> None:
     model = small_ialm(8)
     model.save(tmp_path / "ialm")
