@@ -266,7 +266,7 @@ def test_what_each_mode_takes_the_person_to_see(model: MappedModel) -> None:
         if mode == "perfect-information":  # told of walls all around, it has them on its map
             assert (belief.kinds == WALL).sum() > 15
     counts = model.person.moments[0]
-    np.testing.assert_allclose(expected["zero"], counts / counts.sum())
+    np.testing.assert_allclose(expected["zero"], counts / counts.sum(), atol=1e-3)  # but for the smoothing of rows
     assert np.abs(expected["random"] - expected["zero"]).max() > 0.05
     assert np.abs(expected["perspective-shift"] - expected["zero"]).max() > 0.05
 
