@@ -319,7 +319,7 @@ def imagine(belief: np.ndarray, configuration: int, model: ShiftModel, *, planne
 
 
 class InfluenceBelief:
-    """b~ over the other agent's code, without memory, under an influence mode (the table in nesy.perspective.influence).
+    """b~ over the other agent's code, without memory, under an influence mode (table: nesy.perspective.influence).
 
     `zero` is uniform, and `random` a code of which each factor is drawn evenly; `perspective-shift` is Φ of the own
     belief, and `egocentric` the own belief. Under every mode b~ is uniform while the other agent is unseen, and where Φ

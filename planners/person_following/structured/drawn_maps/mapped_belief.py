@@ -3,7 +3,8 @@
     b(p, lost)   a weight each; the robot's own pose and the map follow from what it did and saw
 
 A step draws the new view into the map, moves every weight on by I(u | l) and weighs it by whether the person was seen
-there or not, and by that the episode went on. An influence mode (nesy.perspective.influence) says what the person is taken to see:
+there or not, and by that the episode went on. An influence mode (nesy.perspective.influence) says what the person is
+taken to see:
 
     perspective-shift     what the map says around the person: seen from its place, remembered by the robot
     egocentric            what the map says around the robot
