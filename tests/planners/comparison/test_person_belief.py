@@ -83,9 +83,9 @@ def test_a_planner_reports_the_particles_that_it_plans_in(tiny_run: Path, kind: 
     assert np.isnan(believed[1]).all()
     agent: Any = player.agent
     for i in (0, 2):
-        n = agent.model.num_factors
+        n = agent.local_model.num_factors
         codes = agent.beliefs[i].states[:, n : 2 * n]
-        np.testing.assert_allclose(believed[i], (codes[..., None] == np.arange(agent.model.num_values)).mean(0))
+        np.testing.assert_allclose(believed[i], (codes[..., None] == np.arange(agent.local_model.num_values)).mean(0))
     # under `zero` b~ says nothing, but particles are of codes that persons have
     assert not says_something(percepts.shifted).any() and says_something(believed)[[0, 2]].all()
 
