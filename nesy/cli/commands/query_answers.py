@@ -146,6 +146,8 @@ def _why(knowledge: KnowledgeBase, options: Arguments) -> dict[str, Any]:
         "question": f"Why does {choice.agent} choose {choice.action}?",
         "text": "\n".join(lines),
         "agent": choice.agent,
+        "algorithm": choice.algorithm,
+        "model": choice.model,
         "action": choice.action,
         "values": choice.values,
         "visits": choice.visits,

@@ -93,16 +93,15 @@ function replayView(root, data) {
       grid(digits, size, kinds, label, [{ ...viewer, kind }, ...others], marks);
     const seen = now.seen ? [{ x: now.seen[0], y: now.seen[1], heading: now.seen[2], kind: "person" }] : [];
     const where = now.seen ? "the person is in view" : "the person is not in view";
-    const unused = episode.uses_beliefs ? "" : " This agent does not use it.";
     return [
-      panel("Map", mapOf(episode), legend()),
+      panel("Map", mapOf(episode), legend(), h("p", { class: "note" }, `Decides: ${episode.algorithm}; model: ${episode.model}.`)),
       panel("What the robot sees", picture(now.view, `The robot's view; ${where}`, "robot", seen),
         h("p", { class: "note" }, `Upwards is ahead; ${where}.`)),
-      panel("Belief b", beliefMap(now.belief, k, data.factor_names, "Belief b"),
-        h("p", { class: "note" }, `Factors by values; a dot marks certainty.${unused}`)),
-      panel("Shifted belief b~", beliefMap(now.shifted, k, data.factor_names, "Shifted belief b~"),
-        h("p", { class: "note" }, (now.decoded_shifted ? "What the person is taken to believe." :
-          "Nothing is known of what the person believes.") + unused)),
+      now.belief ? panel("Belief b", beliefMap(now.belief, k, data.factor_names, "Belief b"),
+        h("p", { class: "note" }, "Factors by values; a dot marks certainty.")) : null,
+      now.shifted ? panel("Belief b~ of what the person sees", beliefMap(now.shifted, k, data.factor_names, "Belief b~"),
+        h("p", { class: "note" }, now.decoded_shifted ? "What the agent takes the person to see." :
+          "The agent knows nothing of what the person sees.")) : null,
       panel("What the person sees", personViews(now, size, picture)),
       now.q ? panel("Q values of the DQN", bars("Value of every action",
         now.q.map((value, a) => [data.action_names[a], value]), now.action)) : null,

@@ -26,17 +26,16 @@ from nesy.errors import UserError
 from nesy.progress import SILENT, Progress
 from nesy.run_folder import RunFolder, atomic_path, read_json
 from planners.agents import Agent, BeliefAgent, says_something
-from planners.comparison.evaluation import evaluation_maps
+from planners.comparison.evaluation import Player, evaluation_maps
 from planners.comparison.grid import EVALUATION_SEED, Cell, cell_path, grid
-from planners.comparison.model_store import ModelStore
-from planners.comparison.players import cell_seed, restored_player
+from planners.comparison.players import restored_player
 from planners.comparison.replay.choice import MOST_EPISODES, Chosen, all_reasons, choose
 from planners.config import CompareConfig
 from planners.perception import Perception, Percepts
 from planners.search.tree import Tree
 from planners.search.tree_top import in_words, top_of_flat_tree, top_of_pomdp_py_tree
 
-FORMAT, VERSION = "nesy-replays", 1
+FORMAT, VERSION = "nesy-replays", 2
 RULE = (
     "of every agent under every condition, first seed: the first success, the first failure, and the worst regret "
     "(the optimum's return on the same episode, or the best agent's where there is no optimum, minus its own)"
@@ -146,8 +145,7 @@ def _play(
     """Play the cell's episodes as `evaluate` does, deciding and recording in the chosen ones."""
     player = restored_player(cell, run, domain, config, seed)
     agent, perception = player.agent, player.perception
-    watching = perception or _onlooker(run, cell_seed(cell, seed))
-    shield = _shield(config, watching, domain) if perception is not None else None
+    shield = None if perception is None else _shield(config, perception, domain)
     start_maps = evaluation_maps(domain, cell.variant, episodes)
     env: Any = domain.make(
         "following", episodes, variant=cell.variant, seed=EVALUATION_SEED + cell.seed, maps=start_maps, cycle=True
@@ -160,15 +158,14 @@ def _play(
     last: np.ndarray | None = None
     while active.any():
         person_views = env.person_views()
-        actions, perceived = player.decide(env, observation, active, last)
-        percepts = watching(observation, person_views) if perceived is None else perceived
-        believed = agent.person_belief()  # a reference has none: for pictures, Φ of what it saw
-        believed = percepts.shifted if believed is None else believed
+        actions, percepts = player.decide(env, observation, active, last)
+        believed = agent.person_belief()
         states = env.states()
         moments = {
             int(i): {
                 **_scene(states[i], maps),
-                **_senses(observation, percepts, believed, person_views, watching, domain, int(i)),
+                **_senses(observation, person_views, domain, int(i)),
+                **_beliefs(player, percepts, believed, int(i)),
                 **_thoughts(agent, percepts, int(i)),
                 **_rules(shield, percepts, domain, int(i)),
                 "action": int(actions[i]),
@@ -183,29 +180,23 @@ def _play(
                 active[i] = False
         last = actions
     env.close()
-    return [_record(cell, item, steps[item.episode], outcomes[item.episode], perception) for item in chosen]
+    return [_record(cell, item, steps[item.episode], outcomes[item.episode], agent) for item in chosen]
 
 
-def _record(
-    cell: Cell, item: Chosen, steps: list[dict[str, Any]], outcome: str, perception: Perception | None
-) -> dict[str, Any]:
+def _record(cell: Cell, item: Chosen, steps: list[dict[str, Any]], outcome: str, agent: Agent) -> dict[str, Any]:
     total = sum(step["reward"] for step in steps)
     return {
         **asdict(cell),
+        "algorithm": agent.algorithm,
+        "model": agent.model,
         "episode": item.episode,
         "why": list(item.reasons),
         "outcome": outcome,
         "return": round(item.total, 3),
         "regret": None if item.regret is None else round(item.regret, 3),
         "reproduced": outcome == item.outcome and abs(total - item.total) < 1e-3 * max(len(steps), 1),
-        "uses_beliefs": perception is not None,
         "steps": steps,
     }
-
-
-def _onlooker(run: RunFolder, seed: int) -> Perception:
-    """What an agent without perception would have believed, for pictures."""
-    return Perception(ModelStore(run).codec, "perspective-shift", np.random.default_rng(seed))
 
 
 def _shield(config: CompareConfig, perception: Perception, domain: Domain) -> Any:
@@ -232,40 +223,41 @@ def _scene(state: dict[str, Any], maps: dict[str, int]) -> dict[str, Any]:
     return scene
 
 
-def _senses(
-    observation: dict[str, np.ndarray],
-    percepts: Percepts,
-    believed: np.ndarray,
-    person_views: np.ndarray,
-    perception: Perception,
-    domain: Domain,
-    i: int,
-) -> dict[str, Any]:
-    """What is seen and believed: views as digits [vx][vy], beliefs as values or distributions per factor.
-
-    `believed` [B, N, K]: what the agent acted on, of what the person sees.
-    """
-    configuration = int(percepts.configurations[i])
-    codec: Any = perception.codec
-    shifted = believed[i]
-    informed = bool(says_something(believed)[i])
-    decoded = codec.views(np.stack([percepts.beliefs[i], shifted]).argmax(axis=2).astype(np.uint8))
+def _senses(observation: dict[str, np.ndarray], person_views: np.ndarray, domain: Domain, i: int) -> dict[str, Any]:
+    """What the robot and the person see: views as digits [vx][vy], and where the robot sees the person."""
+    configuration = int(observation["configuration"][i])
     seen = [int(part[0]) for part in domain.spec.geometry.decode(np.array([configuration]))]
     return {
         "view": _digits(observation["view"][i]),
         "seen": seen if configuration > 0 else None,
-        "belief": _distributions(percepts.beliefs[i]),
-        "shifted": _distributions(shifted),
-        "decoded": _digits(decoded[0]),
-        "decoded_shifted": _digits(decoded[1]) if informed else None,
         "person_view": _digits(person_views[i]),
     }
 
 
-def _thoughts(agent: Agent, percepts: Percepts, i: int) -> dict[str, Any]:
+def _beliefs(player: Player, percepts: Percepts | None, believed: np.ndarray | None, i: int) -> dict[str, Any]:
+    """What the agent acted on, as values or distributions per factor, and the views that these mean.
+
+    b where it acts on its code; `believed` [B, N, K] of what the person sees. An agent that keeps neither shows none,
+    and where a belief says nothing there is no view.
+    """
+    shown: dict[str, Any] = dict.fromkeys(("belief", "decoded", "shifted", "decoded_shifted"))
+    if percepts is None:
+        return shown
+    codec: Any = player.codec
+    if getattr(player.agent, "acts_on_code", True):
+        shown["belief"] = _distributions(percepts.beliefs[i])
+        shown["decoded"] = _digits(codec.views(percepts.beliefs[i : i + 1].argmax(axis=2).astype(np.uint8))[0])
+    if believed is not None:
+        shown["shifted"] = _distributions(believed[i])
+        if says_something(believed)[i]:
+            shown["decoded_shifted"] = _digits(codec.views(believed[i : i + 1].argmax(axis=2).astype(np.uint8))[0])
+    return shown
+
+
+def _thoughts(agent: Agent, percepts: Percepts | None, i: int) -> dict[str, Any]:
     """The values that the agent weighed: of a value network, or of a search with the top of its tree."""
     policy: Any = getattr(agent, "policy", None)
-    if hasattr(policy, "values"):
+    if percepts is not None and hasattr(policy, "values"):
         one = Percepts(*(part[i : i + 1] for part in percepts))
         return {"q": [round(float(value), 3) for value in policy.values(one)[0]]}
     if not isinstance(agent, BeliefAgent):
@@ -297,9 +289,9 @@ def _tree_of(planner: Any, window: int) -> dict[str, Any] | None:
     return top_of_flat_tree(tree, planner.describe) if isinstance(tree, Tree) else None
 
 
-def _rules(shield: Any, percepts: Percepts, domain: Domain, i: int) -> dict[str, Any]:
+def _rules(shield: Any, percepts: Percepts | None, domain: Domain, i: int) -> dict[str, Any]:
     """Which actions the rules leave here, and which rules forbid the others."""
-    if shield is None:
+    if shield is None or percepts is None:
         return {}
     advice = shield.advise(percepts.codes[i], int(percepts.configurations[i]))
     return {

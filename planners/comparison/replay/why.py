@@ -31,6 +31,10 @@ class Choice:
 
     agent: str
     """Name of the cell."""
+    algorithm: str
+    """What decided."""
+    model: str
+    """What it planned with."""
     action: str
     values: dict[str, float]
     """Expected discounted return of each action, as the agent sees it; of a planner only those that it tried."""
@@ -51,7 +55,7 @@ class Choice:
     def text(self) -> str:
         """For people."""
         ranked = sorted(self.values, key=lambda name: -self.values[name])
-        lines = [f"{self.agent} chooses '{self.action}'"]
+        lines = [f"{self.agent} chooses '{self.action}' ({self.algorithm}; model: {self.model})"]
         for name in ranked:
             tried = f", tried {self.visits[name]} times" if self.visits else ""
             ruled = f", forbidden by {', '.join(self.because[name])}" if name in self.because else ""
@@ -148,6 +152,8 @@ def explain_choice(
         because = player.mask.advise(percepts.codes[0], configuration).because
     return Choice(
         agent=cell.name,
+        algorithm=player.agent.algorithm,
+        model=player.agent.model,
         action=names[action],
         values=values,
         visits=visits,

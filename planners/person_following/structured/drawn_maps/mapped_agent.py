@@ -97,6 +97,7 @@ class MappedSearch:
 class MappedAgent(BeliefAgent):
     """Draws a map, keeps an exact belief over where the person is on it, and searches in it."""
 
+    acts_on_code = False
     algorithm = "one-step expectation by sampling, leaves by imagined trajectories"
     model = "hand-structured: a map drawn on the way; learned tables"
 
