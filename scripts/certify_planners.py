@@ -1,25 +1,33 @@
 """Certify the planners of explicit POMDPs against published values.
 
     python scripts/certify_planners.py [--problems tiger 4,4 5,5 7,8] [--episodes N] [--seconds S] [--json FILE]
+    python scripts/certify_planners.py --files FOLDER [--time-limit 10] [--gap 1e-3] [--brackets FILE.csv] [--json FILE]
 
-For each problem: the solver's bounds, and what acting on the online search is worth (exactly where every belief that
-can come up can be enumerated, else the mean of episodes with a 95 % interval). Exit status 1 where a mark is missed.
+With `--files`: the solver's bounds for every .pomdp file of a folder, and whether they are in order; with `--brackets`
+(lines of file name, lower, upper; by another solver) also whether the two brackets overlap to within the gap.
+
+Else, for each problem: the solver's bounds, and what acting on the online search is worth (exactly where every belief
+that can come up can be enumerated, else the mean of episodes with a 95 % interval). Exit status 1 where a mark is
+missed, bounds cross or brackets do not overlap.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from domains.classic import rocksample, tiger
+from nesy.errors import UserError
 from planners.explicit.point_based import solve
-from planners.explicit.pomdp import TabularPOMDP
+from planners.explicit.pomdp import CrossedBounds, TabularPOMDP
 from planners.search.tree_search import TreeSearch, closed_loop, exact_return
 
 
@@ -64,7 +72,13 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=1.0, help="per decision, for 7,8")
     parser.add_argument("--solver-seconds", type=float, default=120.0)
     parser.add_argument("--json", type=Path, default=None, help="also write the outcomes to this file")
+    parser.add_argument("--files", type=Path, default=None, help="a folder of .pomdp files, or one file")
+    parser.add_argument("--time-limit", type=float, default=10.0, help="seconds per file")
+    parser.add_argument("--gap", type=float, default=1e-3, help="of the bounds, at which a file is done")
+    parser.add_argument("--brackets", type=Path, default=None, help="CSV of another solver's bounds: file,lower,upper")
     arguments = parser.parse_args()
+    if arguments.files:
+        return sweep(arguments.files, arguments.time_limit, arguments.gap, arguments.brackets, arguments.json)
     outcomes = []
     print("| problem | published | solver's bounds (s) | search | s per decision | mark |")
     print("| --- | --- | --- | --- | --- | --- |")
@@ -80,6 +94,58 @@ def main() -> int:
     if arguments.json:
         arguments.json.write_text(json.dumps(outcomes, indent=2) + "\n", encoding="utf-8")
     return 0 if all(outcome["passed"] for outcome in outcomes) else 1
+
+
+def sweep(files: Path, time_limit: float, gap: float, brackets: Path | None, output: Path | None) -> int:
+    """Solve every file and print a table; 1 where bounds cross or exclude the other solver's."""
+    paths = sorted(files.glob("*.pomdp")) if files.is_dir() else [files]
+    if not paths:
+        print(f"{files}: no .pomdp files", file=sys.stderr)
+        return 2
+    others = _brackets(brackets) if brackets else {}
+    print("| file | states, actions, observations | discount | bounds | seconds | verdict |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    rows = []
+    for path in paths:
+        row = bounds_of(path, time_limit, gap, others.get(path.name))
+        rows.append(row)
+        bounds = "" if row["lower"] is None else f"{row['lower']:.7g} to {row['upper']:.7g}"
+        cells = (path.name, row["sizes"], row["discount"], bounds, f"{row['seconds']:.2f}", row["verdict"])
+        print("| " + " | ".join(map(str, cells)) + " |", flush=True)
+    if output:
+        output.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+    return int(any(row["verdict"].isupper() for row in rows))
+
+
+def bounds_of(path: Path, time_limit: float, gap: float, other: tuple[float, float] | None) -> dict[str, Any]:
+    """The solver's bounds for a file; the verdict is in capitals where it is a failure."""
+    row: dict[str, Any] = {
+        "file": path.name,
+        "sizes": "",
+        "discount": None,
+        "lower": None,
+        "upper": None,
+        "seconds": 0.0,
+    }
+    try:
+        model = TabularPOMDP.from_file(path)
+        row["sizes"] = f"{len(model.states)}, {len(model.actions)}, {len(model.observations)}"
+        row["discount"] = model.discount
+        found = solve(model, gap=gap, time_limit=time_limit)
+    except UserError as error:
+        return {**row, "verdict": f"refused: {error}"}
+    except CrossedBounds:
+        return {**row, "verdict": "CROSSED"}
+    verdict = "closed" if found.upper - found.lower <= gap else "open"
+    slack = max(gap, found.bounds.precision)
+    if other and (found.lower > other[1] + slack or found.upper < other[0] - slack):
+        verdict = "EXCLUDES THE OTHER BRACKET"
+    return {**row, "lower": found.lower, "upper": found.upper, "seconds": found.seconds, "verdict": verdict}
+
+
+def _brackets(path: Path) -> dict[str, tuple[float, float]]:
+    with path.open(encoding="utf-8", newline="") as lines:
+        return {name: (float(lower), float(upper)) for name, lower, upper in csv.reader(lines)}
 
 
 def certify(problem: str, episodes: int, seconds: float, solver_seconds: float) -> Outcome:

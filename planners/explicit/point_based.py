@@ -4,24 +4,30 @@
     upper bound   U(b), a sawtooth interpolation of points, started with the fast informed bound
     search        from the start belief along argmax_a U and the observation with most excess uncertainty
 
-What it returns is a certificate: the optimal value lies between the bounds.
+What it returns is a certificate: the optimal value lies between the bounds, whenever the search was stopped.
 Sources: Smith and Simmons 2005 (HSVI2); Hauskrecht 2000 (fast informed bound).
 """
 
 from __future__ import annotations
 
+import math
 import time
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
 
 from nesy.errors import UserError
 from planners.explicit import bound_kernels as kernels
 from planners.explicit.bound_kernels import BoundSet
-from planners.explicit.pomdp import TabularPOMDP, check_solvable
+from planners.explicit.informed_bound import Informed, fast_informed_bound
+from planners.explicit.pomdp import CrossedBounds, TabularPOMDP, check_solvable
+from planners.explicit.state_bounds import blind_policies, optimum
 
-_FEW = 2000  # points x actions x observations
+_BEGINNING = 0.5  # share of the time that the bounds to start from may take
+_FINE = 1e-13  # improvements smaller than this, relative to the values, are not kept
+_OVERHEAD = 100_000  # of a backup outside of the kernels, in products
+_LITTLE = 0.01  # share of the gap by which a sweep has to improve to be repeated
 _DEEPEST = 400
 _ROOM = 256
 Belief = tuple[np.ndarray, np.ndarray]
@@ -35,7 +41,7 @@ class Certificate:
         lower, upper: bounds of the optimal discounted value.
         vectors: of the lower bound, blind policies not counted.
         trials: searches from the start belief.
-        seconds: time spent.
+        seconds: time spent, all in all.
         bounds: both bounds at any belief, for a search to go on from.
     """
 
@@ -52,8 +58,7 @@ class Certificate:
 
     def at(self, belief: np.ndarray) -> tuple[float, float]:
         """Lower and upper bound at `belief`, float64 [S]."""
-        sparse = sparse_belief(self.bounds.model.check_belief(belief))
-        return self.bounds.lower(sparse), self.bounds.upper(sparse)
+        return self.bounds.at(sparse_belief(self.bounds.model.check_belief(belief)))
 
 
 def solve(model: TabularPOMDP, gap: float = 1e-3, time_limit: float = 60.0, max_trials: int = 100_000) -> Certificate:
@@ -61,33 +66,34 @@ def solve(model: TabularPOMDP, gap: float = 1e-3, time_limit: float = 60.0, max_
 
     Args:
         model: with a discount below 1.
-        gap: absolute difference of the bounds at which to stop.
-        time_limit: seconds after which to stop with the bounds so far.
+        gap: absolute difference of the bounds at which to stop. Where rounding does not allow it, the solver stops
+            at what rounding allows.
+        time_limit: seconds after which to stop with the bounds so far, which hold however early that is.
         max_trials: searches after which to stop.
 
     Raises:
         UserError: a discount of 1, for which the bounds need not converge; limits that cannot be met.
+        CrossedBounds: a lower bound above an upper one.
     """
     check_solvable(model, "the solver")
     if not (gap >= 0 and time_limit >= 0 and max_trials >= 0):
         raise UserError("the gap, the time limit and the number of trials must not be negative")
-    bounds = PointBounds(model)
-    start = sparse_belief(model.start)
-    bounds.improve(start)  # compiles the kernels, which is not to count
     started = time.perf_counter()
+    deadline = started + time_limit
+    bounds = PointBounds(model, started + _BEGINNING * time_limit)
+    start = sparse_belief(model.start)
     trials = 0
-    while trials < max_trials and time.perf_counter() - started < time_limit:
-        lower, upper = bounds.lower(start), bounds.upper(start)
-        if lower > upper + 1e-6:
-            warnings.warn(f"lower bound {lower:.6g} above upper bound {upper:.6g}", RuntimeWarning, stacklevel=2)
-        if upper - lower <= gap:
+    while trials < max_trials and time.perf_counter() < deadline:
+        lower, upper = bounds.at(start)
+        if upper - lower <= max(gap, bounds.precision):
             break
-        bounds.explore(start, gap, started + time_limit)
-        bounds.sweep(start, gap)
+        backups = bounds.explore(start, gap, deadline)
+        bounds.sweep(start, gap, deadline, backups)
         trials += 1
+    lower, upper = bounds.at(start)
     return Certificate(
-        lower=bounds.lower(start),
-        upper=bounds.upper(start),
+        lower=lower,
+        upper=upper,
         vectors=int(bounds.arrays.used[0]),
         trials=trials,
         seconds=time.perf_counter() - started,
@@ -101,73 +107,40 @@ def sparse_belief(belief: np.ndarray) -> Belief:
     return index, np.ascontiguousarray(belief[index], np.float64)
 
 
-def blind_policies(model: TabularPOMDP) -> np.ndarray:
-    """Value of always doing one action, float64 [A, S]: iterated from below, so it is a lower bound at any time."""
-    out = np.empty_like(model.reward)
-    for a, (matrix, reward) in enumerate(zip(model.transition, model.reward, strict=True)):
-        value = np.full(len(reward), min(float(reward.min()), 0.0) / (1 - model.discount))
-        value[model.terminal] = 0.0
-        for _ in range(2000):
-            after = reward + model.discount * (matrix @ value)
-            done = np.abs(after - value).max() < 1e-9
-            value = after
-            if done:
-                break
-        out[a] = value
-    return out
-
-
-def fast_informed_bound(model: TabularPOMDP) -> np.ndarray:
-    """Upper bound of the value per state, float64 [S]: iterated from above (Hauskrecht 2000)."""
-    q = model.fully_observed + 1e-8
-    for _ in range(300):
-        after = np.empty_like(q)
-        for a, matrix in enumerate(model.transition):
-            best = np.zeros(len(model.states))
-            for o in range(len(model.observations)):
-                weighted = model.observation[a][:, o]
-                if weighted.any():
-                    best += (matrix @ (weighted[:, None] * q.T)).max(axis=1)
-            after[a] = model.reward[a] + model.discount * best
-        done = np.abs(after - q).max() < 1e-7
-        q = np.minimum(after, q)
-        if done:
-            break
-    return np.asarray(q.max(axis=0))
-
-
 class PointBounds:
     """Both bounds, as growing arrays (planners.explicit.bound_kernels).
 
     Attributes:
         flat: the model for the kernels.
         arrays: the bounds for the kernels; replaced when they grow.
+        scale: greatest value or reward, without its sign.
+        precision: what rounding can make of a value.
+        ahead: the last step ahead.
     """
 
-    def __init__(self, model: TabularPOMDP) -> None:
+    def __init__(self, model: TabularPOMDP, deadline: float = math.inf) -> None:
         self.model, self.flat = model, kernels.flatten(model)
-        num_actions, num_states = model.reward.shape
-        num_observations = len(model.observations)
+        fully_observed = optimum(model, deadline)
         self.arrays = BoundSet(
-            blind_policies(model),
+            blind_policies(model, deadline),
             np.zeros(_ROOM + 1, np.int64),
             np.zeros(0, np.int64),
             np.zeros(0),
             np.zeros(_ROOM, np.int64),
-            fast_informed_bound(model),
+            fast_informed_bound(model, self.flat, fully_observed, deadline),
             np.zeros(_ROOM + 1, np.int64),
             np.zeros(0, np.int64),
             np.zeros(0),
             np.zeros(_ROOM),
             np.zeros(2, np.int64),
         )
+        self.scale = float(max(np.abs(table).max() for table in (self.arrays.blind, self.arrays.corner, model.reward)))
+        self.precision = precision(model, self.scale)
         self.prune_at = _ROOM
         self.point_of: dict[bytes, int] = {}
-        self.dense, self.other = np.zeros(num_states), np.zeros(num_states)
-        self.q_lower, self.q_upper = np.zeros(num_actions), np.zeros(num_actions)
-        shape = (num_actions, num_observations)
-        self.chosen, self.chances = np.zeros(shape, np.int64), np.zeros(shape)
-        self.lowers, self.uppers = np.zeros(shape), np.zeros(shape)
+        self.ahead = kernels.room_ahead(self.flat)
+        self.dense = self.ahead.dense
+        self.inner = np.flatnonzero(~model.terminal)
 
     def lower(self, belief: Belief) -> float:
         """L at a sparse belief."""
@@ -182,17 +155,27 @@ class PointBounds:
         """U at a sparse belief."""
         return float(kernels.upper_at(self.arrays, *belief, self.dense))
 
-    def explore(self, start: Belief, gap: float, deadline: float) -> None:
-        """One trial: down to where the bounds are close enough for their depth, and back up with updates."""
+    def at(self, belief: Belief) -> tuple[float, float]:
+        """Both bounds at a sparse belief, in order.
+
+        Raises:
+            CrossedBounds: they are not, by more than rounding explains.
+        """
+        return ordered(self.lower(belief), self.upper(belief), self.precision)
+
+    def explore(self, start: Belief, gap: float, deadline: float) -> int:
+        """One trial: down to where the bounds are close enough for their depth, and back up; how many backups."""
         path, belief, allowed = [start], start, gap
         while time.perf_counter() < deadline and len(path) < _DEEPEST:
             self._look(belief)
             if self.upper(belief) - self.lower(belief) <= allowed:
                 break
+            if not self.model.discount:
+                break
             allowed /= self.model.discount
-            a = int(self.q_upper.argmax())
-            excess = self.chances[a] * (self.uppers[a] - self.lowers[a] - allowed)
-            excess[self.chances[a] <= 0] = -np.inf
+            a = int(self.ahead.q_upper.argmax())
+            excess = self.ahead.chances[a] * (self.ahead.uppers[a] - self.ahead.lowers[a] - allowed)
+            excess[self.ahead.chances[a] <= 0] = -np.inf
             o = int(excess.argmax())
             if excess[o] <= 0:
                 break
@@ -201,51 +184,57 @@ class PointBounds:
             path.append(belief)
         for visited in reversed(path):
             self.improve(visited)
+            if time.perf_counter() >= deadline:
+                break
+        return len(path)
 
-    def sweep(self, start: Belief, gap: float) -> None:
-        """Where the points are few, improve all of them until little changes: values then travel round cycles."""
-        points = int(self.arrays.used[1])
-        if points * self.chances.size > _FEW:
-            return
-        before = np.inf
-        for _ in range(50):
+    def sweep(self, start: Belief, gap: float, deadline: float, backups: int) -> None:
+        """Improve all points until little changes, as values travel round cycles; at most the work of the trial before.
+
+        Work is counted, not timed, so that results repeat.
+        """
+        left = backups * (2 * _OVERHEAD + self._work())
+        before, little = math.inf, max(_LITTLE * gap, _FINE * self.scale)
+        while True:
+            points = int(self.arrays.used[1])
+            work = self._work()
+            while (cost := (points + len(self.inner)) * work) <= left:
+                left -= cost
+                gained = kernels.tighten(self.flat, self.arrays, self.inner, self.ahead)
+                if gained <= little or time.perf_counter() >= deadline:
+                    break
+            left -= points * (_OVERHEAD + work)
+            if left < 0:
+                return
             for p in range(points):
                 begin, end = self.arrays.point_begin[p : p + 2]
-                self.improve((self.arrays.point_index[begin:end], self.arrays.point_value[begin:end]))
+                self.improve((self.arrays.point_index[begin:end].copy(), self.arrays.point_value[begin:end].copy()))
             now = self.upper(start) - self.lower(start)
-            if before - now < 0.01 * gap:
-                break
+            if before - now <= little or time.perf_counter() >= deadline:
+                return
             before = now
+
+    def _work(self) -> int:
+        """About how many products one backup of the upper bound takes."""
+        return int(self.ahead.chances.size * (1 + self.arrays.point_begin[self.arrays.used[1]]))
 
     def improve(self, belief: Belief) -> None:
         """Backups of both bounds at one belief."""
         self._look(belief)
-        action = int(self.q_lower.argmax())
-        if self.q_lower[action] > self.lower(belief) + 1e-10:
+        action = int(self.ahead.q_lower.argmax())
+        if self.ahead.q_lower[action] > self.lower(belief) + _FINE * self.scale:
             self._add_alpha(belief[0], action)
-        upper = float(self.q_upper.max())
-        if upper < self.upper(belief) - 1e-10:
+        upper = float(self.ahead.q_upper.max())
+        if upper < self.upper(belief) - _FINE * self.scale:
             self._add_point(belief, upper)
 
     def _look(self, belief: Belief) -> None:
-        kernels.look(
-            self.flat,
-            self.arrays,
-            *belief,
-            self.dense,
-            self.other,
-            self.q_lower,
-            self.q_upper,
-            self.chosen,
-            self.chances,
-            self.lowers,
-            self.uppers,
-        )
+        kernels.look(self.flat, self.arrays, *belief, self.ahead)
 
     def _add_alpha(self, index: np.ndarray, action: int) -> None:
-        made = kernels.backed_up(self.flat, self.arrays, action, self.chosen[action], index)
+        made = kernels.backed_up(self.flat, self.arrays, action, self.ahead.chosen[action], index)
         if self.arrays.used[0] == self.prune_at:
-            self._prune()
+            self.prune()
         count = int(self.arrays.used[0])
         begin = int(self.arrays.alpha_begin[count])
         end = begin + len(index)
@@ -259,7 +248,7 @@ class PointBounds:
         self.arrays.alpha_begin[count + 1], self.arrays.alpha_action[count] = end, action
         self.arrays.used[0] = count + 1
 
-    def _prune(self) -> None:
+    def prune(self) -> None:
         """Drop vectors that another one over the same states is at least as good as."""
         arrays, count = self.arrays, int(self.arrays.used[0])
         spans = list(zip(arrays.alpha_begin[:count], arrays.alpha_begin[1 : count + 1], strict=True))
@@ -277,10 +266,15 @@ class PointBounds:
 
     def _add_point(self, belief: Belief, value: float) -> None:
         index, mass = belief
+        if len(index) == 1:
+            kernels.lower_corner(self.arrays, index[0], value / mass[0])
+            return
         gain = value - float(self.arrays.corner[index] @ mass)
         key = index.tobytes() + np.round(mass, 10).tobytes()
         if key in self.point_of:
-            self.arrays.point_gain[self.point_of[key]] = gain
+            known = self.point_of[key]  # equal to ten digits: the gain is that of this one
+            begin = int(self.arrays.point_begin[known])
+            self.arrays.point_gain[known], self.arrays.point_value[begin : begin + len(mass)] = gain, mass
             return
         count = int(self.arrays.used[1])
         begin = int(self.arrays.point_begin[count])
@@ -297,8 +291,44 @@ class PointBounds:
         self.arrays.used[1] = count + 1
 
 
+def precision(model: TabularPOMDP, scale: float) -> float:
+    """What rounding can make of values up to `scale`; bounds may cross by no more."""
+    return scale * (1e-9 + 64 * float(np.finfo(float).eps) / (1 - model.discount))
+
+
+def ordered(lower: float, upper: float, tolerance: float) -> tuple[float, float]:
+    """Bounds that cross by no more than `tolerance`, in order.
+
+    Raises:
+        CrossedBounds: they cross by more.
+    """
+    if not lower <= upper + tolerance:
+        raise CrossedBounds(
+            f"the lower bound {lower:.9g} is above the upper bound {upper:.9g}: a bug, please report it"
+        )
+    return min(lower, upper), max(lower, upper)
+
+
 def _with_room(array: np.ndarray, size: int) -> np.ndarray:
     """The array itself if it holds `size` entries, else a copy with room for twice as many."""
     if len(array) >= size:
         return array
     return np.concatenate([array, np.zeros(2 * size - len(array), array.dtype)])
+
+
+def _load_kernels() -> None:
+    """Solve a model of one state: kernels are loaded with this module, so that time limits are those of solving."""
+    one = np.ones((1, 1))
+    model = TabularPOMDP(["s"], ["a"], ["o"], [sparse.csr_array(one)], one[None], one, 0.5, one[0], one[0] < 1)
+    bounds, start = PointBounds(model), sparse_belief(model.start)
+    bounds.arrays.corner[:] += 1.0
+    bounds.arrays.blind[:] -= 1.0
+    bounds.explore(start, 0.0, math.inf)
+    bounds.sweep(start, 0.0, math.inf, 1)
+    bounds.prune()
+    process = Informed(bounds.flat)
+    process.apply(np.ones(1), math.inf)
+    process.system()
+
+
+_load_kernels()

@@ -8,23 +8,34 @@ Terminal states are marked as such: they earn nothing and are never left.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy import sparse
 
 from nesy.errors import UserError
 
+_OFF = 1e-5  # by which a row may miss 1, or by what writing its entries with six digits makes of it
+_HALF_DIGIT = 5e-7
 
-@dataclass(frozen=True, eq=False)
+
+class CrossedBounds(ArithmeticError):
+    """A lower bound above an upper one by more than rounding explains: a bug of ours."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class TabularPOMDP:
-    """An explicit POMDP; arrays as in the module's head, checked when built.
+    """An explicit POMDP; arrays (or nested lists) as in the module's head, checked and copied when built.
+
+    Rows of probabilities that were rounded to six digits are scaled to sum to 1.
 
     Raises:
-        UserError: probabilities that do not sum to 1, or shapes that do not fit.
+        UserError: probabilities that do not sum to 1, names given twice, shapes that do not fit.
     """
 
     states: Sequence[str]
@@ -38,9 +49,18 @@ class TabularPOMDP:
     terminal: np.ndarray
 
     def __post_init__(self) -> None:
+        for what in ("states", "actions", "observations"):
+            self._set(what, _names(what, getattr(self, what)))
         num_states, num_actions, num_observations = len(self.states), len(self.actions), len(self.observations)
-        matrices = tuple(sparse.csr_array(matrix) for matrix in self.transition)
-        object.__setattr__(self, "transition", matrices)
+        try:
+            matrices = [_matrix(matrix) for matrix in self.transition]
+        except (TypeError, ValueError) as error:
+            raise UserError(f"transition: one matrix of numbers [S, S'] per action is needed ({error})") from None
+        for what in ("observation", "reward", "start"):
+            self._set(what, _numbers(what, getattr(self, what)))
+        self._set("terminal", _flags(self.terminal))
+        discount = _numbers("discount", self.discount)
+        self._set("discount", float(discount) if discount.ndim == 0 else math.nan)
         for name, found, wanted in (
             ("transition", [m.shape for m in matrices], [(num_states, num_states)] * num_actions),
             ("observation", self.observation.shape, (num_actions, num_states, num_observations)),
@@ -51,30 +71,57 @@ class TabularPOMDP:
             if found != wanted:
                 raise UserError(f"{name}: shape {found}, expected {wanted}")
         if not 0 <= self.discount <= 1:
-            raise UserError(f"discount must be in [0, 1], got {self.discount}")
-        self._check_distributions()
-
-    def _check_distributions(self) -> None:
-        for a, name in enumerate(self.actions):
-            rows = np.asarray(self.transition[a].sum(axis=1)).reshape(-1)
-            for what, sums in (("transitions", rows), ("observations", self.observation[a].sum(axis=1))):
-                if (wrong := np.flatnonzero(~(np.abs(sums - 1) <= 1e-5))).size:
-                    s = int(wrong[0])
-                    raise UserError(
-                        f"{what} of action '{name}' in state '{self.states[s]}' sum to {sums[s]:.6g}, not 1"
-                    )
-            if self.terminal.any():
-                ends = np.flatnonzero(self.terminal)
-                stays = self.transition[a][ends][:, ends].sum(axis=1)
-                if (np.abs(np.asarray(stays) - 1) > 1e-9).any() or self.reward[a, ends].any():
-                    raise UserError(f"action '{name}' leaves a terminal state or earns something there")
-        tables = [*(m.data for m in self.transition), self.observation, self.start]
-        if any((table < 0).any() for table in tables):
+            raise UserError(f"discount must be in [0, 1], got {discount}")
+        self._check_rewards()
+        if any((table < 0).any() for table in (*(m.data for m in matrices), self.observation, self.start)):
             raise UserError("a probability is negative")
+        for a, action in enumerate(self.actions):
+            scales = self._scales(f"transitions of action '{action}'", matrices[a], np.diff(matrices[a].indptr))
+            matrices[a].data *= np.repeat(scales, np.diff(matrices[a].indptr))
+            used = np.count_nonzero(self.observation[a], axis=1)
+            self.observation[a] *= self._scales(f"observations of action '{action}'", self.observation[a], used)[
+                :, None
+            ]
+        self._set("transition", tuple(matrices))
+        total = self.start.sum()
+        if not abs(total - 1) <= max(_OFF, _HALF_DIGIT * np.count_nonzero(self.start)):
+            raise UserError(f"start probabilities sum to {total:.6g}, not 1")
+        self._set("start", self.start / total)
+        self._check_ends()
+
+    def _set(self, name: str, value: Any) -> None:
+        object.__setattr__(self, name, value)
+
+    def _scales(self, what: str, rows: Any, used: np.ndarray) -> np.ndarray:
+        """Factors that make every row sum to 1, float64 [S]; `used` int [S] counts the entries of each."""
+        sums = np.asarray(rows.sum(axis=1)).reshape(-1)
+        wrong = np.flatnonzero(~(np.abs(sums - 1) <= np.maximum(_OFF, _HALF_DIGIT * used)))
+        if wrong.size:
+            s = int(wrong[0])
+            raise UserError(f"{what} in state '{self.states[s]}' sum to {sums[s]:.6g}, not 1")
+        exact = np.abs(sums - 1) <= used * np.finfo(float).eps
+        return np.where(exact, 1.0, 1 / sums)
+
+    def _check_rewards(self) -> None:
         if not np.isfinite(self.reward).all():
             raise UserError("a reward is not a number")
-        if not abs(self.start.sum() - 1) <= 1e-5:
-            raise UserError(f"start probabilities sum to {self.start.sum():.6g}, not 1")
+        with np.errstate(over="ignore"):
+            worth = np.abs(self.reward).max() / max(1 - self.discount, np.finfo(float).eps)
+        if not worth < 1e300:
+            raise UserError(f"rewards up to {np.abs(self.reward).max():.3g} at discount {self.discount} are too large")
+
+    def _check_ends(self) -> None:
+        ends = np.flatnonzero(self.terminal)
+        for a, action in enumerate(self.actions):
+            stays = np.asarray(self.transition[a][ends][:, ends].sum(axis=1)).reshape(-1)
+            wrong = (np.abs(stays - 1) > 1e-9) | (self.reward[a, ends] != 0)
+            if wrong.any():
+                state = self.states[int(ends[wrong.argmax()])]
+                raise UserError(f"action '{action}' leaves a terminal state or earns something there ('{state}')")
+
+    def __repr__(self) -> str:
+        sizes = f"{len(self.states)} states, {len(self.actions)} actions, {len(self.observations)} observations"
+        return f"TabularPOMDP({sizes}, discount {self.discount:g})"
 
     @classmethod
     def from_file(cls, path: Path | str) -> TabularPOMDP:
@@ -90,17 +137,17 @@ class TabularPOMDP:
         write(self, Path(path))
 
     def check_belief(self, belief: np.ndarray) -> np.ndarray:
-        """The belief as float64 [S].
+        """The belief as float64 [S], scaled to sum to 1.
 
         Raises:
             UserError: another shape, or no distribution.
         """
-        checked = np.asarray(belief, np.float64)
+        checked = _numbers("a belief", belief)
         if checked.shape != self.start.shape:
             raise UserError(f"a belief has the shape {list(self.start.shape)}, found {list(checked.shape)}")
-        if not ((checked >= 0).all() and abs(checked.sum() - 1) <= 1e-5):
+        if not ((checked >= 0).all() and abs(checked.sum() - 1) <= _OFF):
             raise UserError("a belief is a probability distribution (numbers >= 0 that sum to 1)")
-        return checked
+        return np.asarray(checked / checked.sum())
 
     def predict(self, belief: np.ndarray, action: int) -> np.ndarray:
         """Belief after the action, before the observation: [S] -> [S]."""
@@ -137,16 +184,62 @@ class TabularPOMDP:
 
     @cached_property
     def fully_observed(self) -> np.ndarray:
-        """Q of the fully observed process: float64 [A, S] (QMDP; an upper bound for every belief)."""
-        value = np.zeros(len(self.states))
-        q = self.reward.copy()
-        for _ in range(10_000):
-            q = self.reward + self.discount * np.stack([matrix @ value for matrix in self.transition])
-            after = q.max(axis=0)
-            if np.abs(after - value).max() < 1e-10:
-                break
-            value = after
-        return q
+        """Q of the fully observed process: float64 [A, S] (QMDP), from above; an upper bound for every belief.
+
+        Raises:
+            UserError: a discount of 1, at which the process need not have a value.
+        """
+        from planners.explicit.state_bounds import optimum
+
+        check_solvable(self, "the fully observed process")
+        return optimum(self)
+
+
+def _names(what: str, names: Any) -> tuple[str, ...]:
+    try:
+        checked = () if isinstance(names, str) else tuple(names)
+    except TypeError:
+        checked = ()
+    if not checked:
+        raise UserError(f"{what}: a list of one or more names is needed, got {names!r}")
+    seen: set[str] = set()
+    for name in checked:
+        if not isinstance(name, str):
+            raise UserError(f"{what}: names are strings, got {name!r}")
+        if name in seen:
+            raise UserError(f"{what}: the name '{name}' is given twice")
+        seen.add(name)
+    return checked
+
+
+def _numbers(what: str, values: Any) -> np.ndarray:
+    """A float64 copy."""
+    try:
+        return np.array(values, np.float64, order="C")
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{what}: numbers are needed ({error})") from None
+
+
+def _flags(values: Any) -> np.ndarray:
+    try:
+        flags = np.array(values)
+    except ValueError as error:
+        raise UserError(f"terminal: true or false per state is needed ({error})") from None
+    if flags.dtype != np.bool_ and not (flags.dtype.kind in "iuf" and np.isin(flags, (0, 1)).all()):
+        raise UserError("terminal: true or false per state is needed")
+    return flags.astype(np.bool_)
+
+
+def _matrix(values: Any) -> sparse.csr_array:
+    """A copy in float64, sorted, without zeros."""
+    if not sparse.issparse(values):
+        values = np.asarray(values, np.float64)
+        if values.ndim != 2:
+            raise ValueError(f"got one of {values.ndim} dimensions")
+    matrix = sparse.csr_array(values, dtype=np.float64, copy=True)
+    matrix.sum_duplicates()
+    matrix.eliminate_zeros()
+    return matrix
 
 
 def check_solvable(model: TabularPOMDP, who: str) -> None:

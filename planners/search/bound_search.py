@@ -16,67 +16,72 @@ from typing import NamedTuple
 import numpy as np
 
 from nesy.compiled import njit
-from planners.explicit.bound_kernels import BoundSet, FlatPOMDP, follow, look, lower_at, upper_at
+from planners.explicit.bound_kernels import Ahead, BoundSet, FlatPOMDP, follow, look, lower_at, upper_at
 
 
 class BeliefTree(NamedTuple):
-    """A tree of beliefs in flat arrays; node 0 is the root, children come after their parents.
+    """A tree of beliefs in flat arrays; node 0 is the root, children come after their parents, siblings side by side.
 
     Attributes:
-        size: int64 [2], nodes and belief entries in use.
-        lower, upper: float64 [capacity].
-        error: float64 [capacity], how much the widest leaf below adds to the node's own width.
-        best: int64 [capacity], the child on the way to that leaf; -1 at leaves.
-        parent, action, seen, depth: int64 [capacity].
-        chance: float64 [capacity], of the observation that leads here.
-        q_lower, q_upper: float64 [capacity, A]; -inf where an action is not allowed.
-        child: int64 [capacity, A, O], -1 where there is none.
-        begin: int64 [capacity, 2], where an expanded node's belief lies in `held` and `value`; -1 before.
-        visits: int64 [capacity], expansions at and below the node.
+        size: int64 [4], nodes, rows and belief entries in use, and whether the last `grow` lacked room.
+        lower, upper: float64 [N].
+        error: float64 [N], how much the widest leaf below adds to the node's own width.
+        chance: float64 [N], of the observation that leads here.
+        best: int32 [N], the child on the way to that leaf; -1 at leaves.
+        parent, action, seen, depth: int32 [N].
+        visits: int32 [N], expansions at and below the node.
+        row: int32 [N], where the arrays of nodes whose beliefs are known have this one; -1 for other leaves.
+        q_lower, q_upper: float64 [R, A]; -inf where an action is not allowed.
+        children: int32 [R, A + 1]; those of action a are children[row, a] : children[row, a + 1].
+        begin: int64 [R + 1], where the beliefs lie in `held` and `value`.
     """
 
     size: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
     error: np.ndarray
+    chance: np.ndarray
     best: np.ndarray
     parent: np.ndarray
     action: np.ndarray
     seen: np.ndarray
     depth: np.ndarray
-    chance: np.ndarray
+    visits: np.ndarray
+    row: np.ndarray
     q_lower: np.ndarray
     q_upper: np.ndarray
-    child: np.ndarray
+    children: np.ndarray
     begin: np.ndarray
-    visits: np.ndarray
     held: np.ndarray
     value: np.ndarray
 
 
-def allocate(capacity: int, entries: int, num_actions: int, num_observations: int) -> BeliefTree:
-    """Room for `capacity` nodes and `entries` states of beliefs."""
-    whole = [np.zeros(capacity, np.int64) for _ in range(5)]
-    real = [np.zeros(capacity) for _ in range(4)]
-    return BeliefTree(
-        np.zeros(2, np.int64),
-        real[0],
-        real[1],
-        real[2],
-        whole[0],
-        whole[1],
-        whole[2],
-        whole[3],
-        whole[4],
-        real[3],
-        np.zeros((capacity, num_actions)),
-        np.zeros((capacity, num_actions)),
-        np.full((capacity, num_actions, num_observations), -1, np.int64),
-        np.full((capacity, 2), -1, np.int64),
-        np.zeros(capacity, np.int64),
-        np.zeros(entries, np.int64),
-        np.zeros(entries),
+def allocate(nodes: int, rows: int, entries: int, num_actions: int) -> BeliefTree:
+    """Room for `nodes` nodes, of which `rows` have beliefs, with `entries` states in all."""
+    return BeliefTree._make(
+        [
+            np.zeros(4, np.int64),
+            *(np.zeros(nodes) for _ in range(4)),
+            *(np.zeros(nodes, np.int32) for _ in range(7)),
+            np.zeros((rows, num_actions)),
+            np.zeros((rows, num_actions)),
+            np.zeros((rows, num_actions + 1), np.int32),
+            np.zeros(rows + 1, np.int64),
+            np.zeros(entries, np.int64),
+            np.zeros(entries),
+        ]
     )
+
+
+def enlarged(tree: BeliefTree, most_nodes: int, most_entries: int) -> BeliefTree | None:
+    """The tree with twice the room, within limits; None where they are reached."""
+    nodes, rows, entries = len(tree.lower), len(tree.q_lower), len(tree.held)
+    if nodes >= most_nodes or entries >= most_entries:
+        return None
+    larger = allocate(min(2 * nodes, most_nodes), 2 * rows, min(2 * entries, most_entries), tree.q_lower.shape[1])
+    for before, after in zip(tree, larger, strict=True):
+        after[: len(before)] = before
+    return larger
 
 
 @njit(cache=True)
@@ -87,78 +92,75 @@ def _add(tree: BeliefTree, parent: int, action: int, seen: int, chance: float, l
     tree.error[node], tree.best[node] = max(upper - lower, 0.0), -1
     tree.parent[node], tree.action[node], tree.seen[node] = parent, action, seen
     tree.depth[node] = tree.depth[parent] + 1 if parent >= 0 else 0
-    tree.chance[node], tree.visits[node] = chance, 0
-    tree.begin[node, 0], tree.begin[node, 1] = -1, -1
-    tree.child[node] = -1
+    tree.chance[node], tree.visits[node], tree.row[node] = chance, 0, -1
     return node
 
 
 @njit(cache=True)
 def plant(tree: BeliefTree, bounds: BoundSet, index: np.ndarray, value: np.ndarray, dense: np.ndarray) -> None:
-    """Begin a tree at a belief."""
-    tree.size[0], tree.size[1] = 0, 0
+    """Begin a tree at a belief, for which there must be room."""
+    tree.size[:] = 0
     root = _add(tree, -1, -1, -1, 1.0, lower_at(bounds, index, value, dense)[0], upper_at(bounds, index, value, dense))
     _hold(tree, root, index, value)
 
 
 @njit(cache=True)
 def _hold(tree: BeliefTree, node: int, index: np.ndarray, value: np.ndarray) -> None:
-    begin = tree.size[1]
+    row, begin = tree.size[1], tree.size[2]
     end = begin + index.shape[0]
-    tree.begin[node, 0], tree.begin[node, 1] = begin, end
+    tree.row[node] = row
+    tree.begin[row], tree.begin[row + 1] = begin, end
+    tree.children[row] = 0
     tree.held[begin:end] = index
     tree.value[begin:end] = value
-    tree.size[1] = end
+    tree.size[1], tree.size[2] = row + 1, end
 
 
 @njit(cache=True)
-def grow(flat: FlatPOMDP, bounds: BoundSet, tree: BeliefTree, count: int, allowed: np.ndarray, tolerance: float) -> int:
+def grow(
+    flat: FlatPOMDP,
+    bounds: BoundSet,
+    tree: BeliefTree,
+    count: int,
+    allowed: np.ndarray,
+    tolerance: float,
+    ahead: Ahead,
+) -> int:
     """Expand up to `count` leaves; how many it was. Stops early when the answer is certain or the tree is full."""
-    num_actions, num_states = flat.reward.shape
-    num_observations = flat.observation.shape[2]
-    dense, other = np.zeros(num_states), np.zeros(num_states)
-    q_lower, q_upper = np.zeros(num_actions), np.zeros(num_actions)
-    chosen = np.zeros((num_actions, num_observations), np.int64)
-    chances = np.zeros((num_actions, num_observations))
-    lowers, uppers = np.zeros((num_actions, num_observations)), np.zeros((num_actions, num_observations))
+    num_actions = flat.reward.shape[0]
+    tree.size[3] = 0
     for done in range(count):
-        if _settled(tree, tolerance) or tree.size[0] + num_actions * num_observations > tree.lower.shape[0]:
+        if _settled(tree, tolerance):
             return done
         node = 0
         while tree.best[node] >= 0:
             node = tree.best[node]
-        if tree.begin[node, 0] < 0:
-            up = tree.parent[node]
-            at, end = tree.begin[up, 0], tree.begin[up, 1]
+        if tree.row[node] < 0:
+            up = tree.row[tree.parent[node]]
+            at, end = tree.begin[up], tree.begin[up + 1]
             index, value, _ = follow(
-                flat, tree.held[at:end], tree.value[at:end], tree.action[node], tree.seen[node], dense
+                flat, tree.held[at:end], tree.value[at:end], tree.action[node], tree.seen[node], ahead.dense
             )
-            if tree.size[1] + index.shape[0] > tree.held.shape[0]:
+            if tree.size[2] + index.shape[0] > tree.held.shape[0] or tree.size[1] == tree.q_lower.shape[0]:
+                tree.size[3] = 1
                 return done
             _hold(tree, node, index, value)
-        at, end = tree.begin[node, 0], tree.begin[node, 1]
-        look(
-            flat,
-            bounds,
-            tree.held[at:end],
-            tree.value[at:end],
-            dense,
-            other,
-            q_lower,
-            q_upper,
-            chosen,
-            chances,
-            lowers,
-            uppers,
-        )
+        row = tree.row[node]
+        at, end = tree.begin[row], tree.begin[row + 1]
+        look(flat, bounds, tree.held[at:end], tree.value[at:end], ahead)
+        if tree.size[0] + np.count_nonzero(ahead.chances) > tree.lower.shape[0]:
+            tree.size[3] = 1
+            return done
         for a in range(num_actions):
+            tree.children[row, a] = tree.size[0]
             if node == 0 and not allowed[a]:
-                tree.q_lower[node, a], tree.q_upper[node, a] = -np.inf, -np.inf
+                tree.q_lower[row, a], tree.q_upper[row, a] = -np.inf, -np.inf
                 continue
-            tree.q_lower[node, a], tree.q_upper[node, a] = q_lower[a], q_upper[a]
-            for o in range(num_observations):
-                if chances[a, o] > 0.0:
-                    tree.child[node, a, o] = _add(tree, node, a, o, chances[a, o], lowers[a, o], uppers[a, o])
+            tree.q_lower[row, a], tree.q_upper[row, a] = ahead.q_lower[a], ahead.q_upper[a]
+            for o in range(flat.num_observations):
+                if ahead.chances[a, o] > 0.0:
+                    _add(tree, node, a, o, ahead.chances[a, o], ahead.lowers[a, o], ahead.uppers[a, o])
+        tree.children[row, num_actions] = tree.size[0]
         _refresh(tree, node, flat.discount)
     return count
 
@@ -166,14 +168,14 @@ def grow(flat: FlatPOMDP, bounds: BoundSet, tree: BeliefTree, count: int, allowe
 @njit(cache=True)
 def _refresh(tree: BeliefTree, node: int, discount: float) -> None:
     """Carry the bounds of a newly expanded node up to the root."""
-    num_actions, num_observations = tree.child.shape[1], tree.child.shape[2]
     while True:
         tree.visits[node] += 1
+        row = tree.row[node]
         low, high, action = -np.inf, -np.inf, 0
-        for a in range(num_actions):
-            low = max(low, tree.q_lower[node, a])
-            if tree.q_upper[node, a] > high:
-                high, action = tree.q_upper[node, a], a
+        for a in range(tree.q_lower.shape[1]):
+            low = max(low, tree.q_lower[row, a])
+            if tree.q_upper[row, a] > high:
+                high, action = tree.q_upper[row, a], a
         up = tree.parent[node]
         # At the root a mask may exclude the actions that the bounds of the whole model count on.
         low = max(low, tree.lower[node]) if up >= 0 else low
@@ -181,17 +183,15 @@ def _refresh(tree: BeliefTree, node: int, discount: float) -> None:
         gained, shed = low - tree.lower[node], high - tree.upper[node]
         tree.lower[node], tree.upper[node] = low, high
         tree.error[node], tree.best[node] = -1.0, -1
-        for o in range(num_observations):
-            child = tree.child[node, action, o]
-            if child >= 0:
-                error = discount * tree.chance[child] * tree.error[child]
-                if error > tree.error[node]:
-                    tree.error[node], tree.best[node] = error, child
+        for child in range(tree.children[row, action], tree.children[row, action + 1]):
+            error = discount * tree.chance[child] * tree.error[child]
+            if error > tree.error[node]:
+                tree.error[node], tree.best[node] = error, child
         if up < 0:
             return
-        share = discount * tree.chance[node]
-        tree.q_lower[up, tree.action[node]] += share * gained
-        tree.q_upper[up, tree.action[node]] += share * shed
+        share, above = discount * tree.chance[node], tree.row[up]
+        tree.q_lower[above, tree.action[node]] += share * gained
+        tree.q_upper[above, tree.action[node]] += share * shed
         node = up
 
 
@@ -202,24 +202,34 @@ def _settled(tree: BeliefTree, tolerance: float) -> bool:
         return False
     if tree.error[0] <= tolerance:
         return True
-    best = 0
+    row, best = tree.row[0], 0
     for a in range(tree.q_lower.shape[1]):
-        if tree.q_lower[0, a] > tree.q_lower[0, best]:
+        if tree.q_lower[row, a] > tree.q_lower[row, best]:
             best = a
     for a in range(tree.q_lower.shape[1]):
-        if a != best and tree.q_upper[0, a] > tree.q_lower[0, best] + tolerance:
+        if a != best and tree.q_upper[row, a] > tree.q_lower[row, best] + tolerance:
             return False
     return True
 
 
 @njit(cache=True)
+def child_of(tree: BeliefTree, action: int, seen: int) -> int:
+    """The node below (action, observation) of the root; -1 where there is none."""
+    row = tree.row[0]
+    for child in range(tree.children[row, action], tree.children[row, action + 1]):
+        if tree.seen[child] == seen:
+            return child
+    return -1
+
+
+@njit(cache=True)
 def reroot(tree: BeliefTree, action: int, seen: int, target: BeliefTree) -> bool:
-    """Copy what lies below (action, observation) of the root into `target`; false where nothing does."""
-    top = tree.child[0, action, seen] if tree.visits[0] > 0 else -1
-    if top < 0 or tree.begin[top, 0] < 0:
+    """Copy what lies below (action, observation) of the root into `target`, as large; false where nothing does."""
+    top = child_of(tree, action, seen) if tree.visits[0] > 0 else -1
+    if top < 0 or tree.row[top] < 0:
         return False
     place = np.full(tree.size[0], -1, np.int64)
-    target.size[0], target.size[1] = 0, 0
+    target.size[:] = 0
     for node in range(top, tree.size[0]):  # parents come before children
         if node != top and place[tree.parent[node]] < 0:
             continue
@@ -229,12 +239,19 @@ def reroot(tree: BeliefTree, action: int, seen: int, target: BeliefTree) -> bool
         )
         place[node] = new
         target.error[new], target.visits[new] = tree.error[node], tree.visits[node]
-        target.q_lower[new], target.q_upper[new] = tree.q_lower[node], tree.q_upper[node]
-        if parent >= 0:
-            target.child[parent, tree.action[node], tree.seen[node]] = new
-            if tree.best[tree.parent[node]] == node:
-                target.best[parent] = new
-        if tree.begin[node, 0] >= 0:
-            at, end = tree.begin[node, 0], tree.begin[node, 1]
+        if parent >= 0 and tree.best[tree.parent[node]] == node:
+            target.best[parent] = new
+        row = tree.row[node]
+        if row >= 0:
+            at, end = tree.begin[row], tree.begin[row + 1]
             _hold(target, new, tree.held[at:end], tree.value[at:end])
+            below = target.row[new]
+            target.q_lower[below], target.q_upper[below] = tree.q_lower[row], tree.q_upper[row]
+    for node in range(top, tree.size[0]):
+        row = tree.row[node]
+        if place[node] < 0 or row < 0 or tree.children[row, 0] == tree.children[row, -1]:
+            continue
+        shift = place[tree.children[row, 0]] - tree.children[row, 0]
+        for a in range(tree.children.shape[1]):
+            target.children[target.row[place[node]], a] = tree.children[row, a] + shift
     return True

@@ -15,25 +15,25 @@ Two methods over the same tables:
 
 from __future__ import annotations
 
+import math
 import time
-import warnings
 from typing import Any, Literal, get_args
 
 import numpy as np
 
 from nesy.errors import UserError
-from planners.explicit.point_based import blind_policies, solve, sparse_belief
+from planners.explicit.point_based import ordered, precision, solve, sparse_belief
 from planners.explicit.pomdp import TabularPOMDP, check_solvable
+from planners.explicit.state_bounds import blind_policies
 from planners.search import bound_search
-from planners.search.bound_search import BeliefTree
 from planners.search.drawing import drawing_of
 from planners.search.random_bits import stream
 from planners.search.tree import allocate, clear, reroot
 from planners.search.walk import best_tried, walks
 from planners.search.walked_models import PackedPOMDP, TabularBelief
 
-_TOLERANCE = 1e-6
-_START_GAP = 0.01
+_TOLERANCE, _START_GAP = 1e-8, 1e-4  # relative to the values: when a decision is certain, and for the offline solver
+_FEW, _MOST_NODES, _MOST_ENTRIES = 256, 4_000_000, 8_000_000  # room of a tree, at first and at most
 _LEAF_WEIGHTS = {"lower": 0.0, "middle": 0.5, "upper": 1.0}
 Method = Literal["bounds", "po-uct"]
 
@@ -83,6 +83,7 @@ class TreeSearch:
 
     Raises:
         UserError: a discount of 1; a number or name that cannot be.
+        CrossedBounds: a lower bound above an upper one.
     """
 
     def __init__(
@@ -109,28 +110,21 @@ class TreeSearch:
         self._planted: np.ndarray | None = None  # the belief that the tree at hand was grown for
         self._carried = False  # whether that tree is left over from an earlier belief
         if method == "bounds":
-            self._bounds = solve(model, gap=_START_GAP, time_limit=1e9, max_trials=trials).bounds
-            self._beliefs, self._spare = self._room(), self._room()
+            gap = _START_GAP * float(np.abs(model.fully_observed).max())
+            self._bounds = solve(model, gap=gap, time_limit=math.inf, max_trials=trials).bounds
+            entries = max(_FEW, len(model.states))
+            self._beliefs = bound_search.allocate(_FEW, _FEW, entries, len(model.actions))
             return
         lower, upper = leaf_values(model)
-        if (lower > upper + 1e-6).any():
-            worst = int((lower - upper).argmax())
-            warnings.warn(
-                f"lower bound above upper bound in state '{model.states[worst]}'", RuntimeWarning, stacklevel=2
-            )
+        self._precision = precision(model, float(max(np.abs(lower).max(), np.abs(upper).max())))
+        for low, high in zip(lower, upper, strict=True):
+            ordered(low, high, self._precision)
         weight = _LEAF_WEIGHTS[leaf]
         self._packed, self._blind = pack(model, (1 - weight) * lower + weight * upper), blind_policies(model)
         self.exploration = float(np.ptp(model.reward)) if exploration is None else exploration
         num_actions = len(model.actions)
         self.tree = allocate(2 * simulations + 2, num_actions)
         self._bits = stream(rng)
-
-    def _room(self) -> BeliefTree:
-        num_actions, num_observations = len(self.model.actions), len(self.model.observations)
-        nodes = self.simulations * num_actions * min(num_observations, 4) + num_actions * num_observations + 1
-        nodes = min(nodes, 4_000_000)
-        entries = min((self.simulations + 1) * len(self.model.states), 8_000_000)
-        return bound_search.allocate(nodes, entries, num_actions, num_observations)
 
     def plan(self, belief: np.ndarray, allowed: np.ndarray | None = None) -> tuple[int, dict[str, Any]]:
         """Choose an action.
@@ -160,9 +154,11 @@ class TreeSearch:
             return False
         before, self._planted = self._planted, None
         if self.method == "bounds":
-            kept = bound_search.reroot(self._beliefs, action, observation, self._spare)
+            nodes, rows, entries = (max(int(size), 1) for size in self._beliefs.size[:3])
+            below = bound_search.allocate(nodes, rows, entries, len(self.model.actions))
+            kept = bound_search.reroot(self._beliefs, action, observation, below)
             if kept:
-                self._beliefs, self._spare = self._spare, self._beliefs
+                self._beliefs = below
         else:
             kept = reroot(self.tree, action, observation)
         if kept:
@@ -185,28 +181,32 @@ class TreeSearch:
         arrays, flat = self._bounds.arrays, self._bounds.flat
         if not self._goes_on(belief, mask):
             bound_search.plant(self._beliefs, arrays, *sparse_belief(belief), self._bounds.dense)
-        tree = self._beliefs
-        before = tree.visits[0]
+        before = self._beliefs.visits[0]
         started, done = time.perf_counter(), 0
         chunk = 8 if self.time_limit > 0 else self.simulations
+        tolerance = max(self._bounds.precision, _TOLERANCE * self._bounds.scale)
         while done < self.simulations:
             if self.time_limit > 0 and done and time.perf_counter() - started >= self.time_limit:
                 break
-            count = bound_search.grow(flat, arrays, tree, min(chunk, self.simulations - done), mask, _TOLERANCE)
+            wanted = min(chunk, self.simulations - done)
+            count = bound_search.grow(flat, arrays, self._beliefs, wanted, mask, tolerance, self._bounds.ahead)
             done += count
-            if count < chunk:
-                break
+            if count < wanted:
+                larger = bound_search.enlarged(self._beliefs, _MOST_NODES, _MOST_ENTRIES)
+                if not self._beliefs.size[3] or larger is None:
+                    break
+                self._beliefs = larger
+        tree = self._beliefs
         if tree.visits[0] == 0:  # an end, where any allowed action will do
             return int(mask.argmax()), {"values": [0.0] * len(mask), "visits": [0] * len(mask), "simulations": 0}
         low, high = tree.q_lower[0].copy(), tree.q_upper[0].copy()
-        if (low[mask] > high[mask] + 1e-6).any():
-            warnings.warn("lower bound above upper bound in the search tree", RuntimeWarning, stacklevel=3)
+        for a in np.flatnonzero(mask):
+            low[a], high[a] = ordered(low[a], high[a], self._bounds.precision)
         action = int(np.where(mask, low, -np.inf).argmax())
         size = int(tree.size[0])
         visits = np.zeros(len(mask), np.int64)
         for a in np.flatnonzero(mask):
-            children = tree.child[0, a]
-            visits[a] = 1 + tree.visits[children[children >= 0]].sum()
+            visits[a] = 1 + tree.visits[tree.children[0, a] : tree.children[0, a + 1]].sum()
         expanded = tree.visits[:size] > 0
         return action, {
             "values": low.tolist(),
@@ -238,8 +238,8 @@ class TreeSearch:
             mask,
             self._bits,
         )
-        info["lower"] = float((self._blind @ belief).max())
-        info["upper"] = float((self.model.fully_observed @ belief).max())
+        lower, upper = float((self._blind @ belief).max()), float((self.model.fully_observed @ belief).max())
+        info["lower"], info["upper"] = ordered(lower, upper, self._precision)
         return best_tried(info, mask), info
 
 
