@@ -14,13 +14,14 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph, linalg
 
-from planners.explicit.pomdp import TabularPOMDP
+if TYPE_CHECKING:
+    from planners.explicit.pomdp import TabularPOMDP
 
 _PACE, _MOST_PACE = 20, 640  # sweeps between two linear systems, or looks at whether one is needed; it doubles
 _PATIENCE = 500  # sweeps still to go above which a linear system is solved instead
