@@ -19,6 +19,7 @@ import numpy as np
 from scipy import sparse
 
 from nesy.errors import UserError
+from planners.explicit.pomdp_file import read, write
 
 _OFF = 1e-5  # by which a row may miss 1, or by what writing its entries with six digits makes of it
 _HALF_DIGIT = 5e-7
@@ -126,14 +127,13 @@ class TabularPOMDP:
     @classmethod
     def from_file(cls, path: Path | str) -> TabularPOMDP:
         """Read Cassandra's `.pomdp` format (planners.explicit.pomdp_file)."""
-        from planners.explicit.pomdp_file import read
-
-        return read(Path(path))
+        try:
+            return cls(**read(Path(path)))
+        except UserError as error:
+            raise error if str(error).startswith(str(path)) else UserError(f"{path}: {error}") from None
 
     def to_file(self, path: Path | str) -> None:
         """Write Cassandra's `.pomdp` format."""
-        from planners.explicit.pomdp_file import write
-
         write(self, Path(path))
 
     def check_belief(self, belief: np.ndarray) -> np.ndarray:

@@ -13,15 +13,18 @@ from __future__ import annotations
 import difflib
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import sparse
 
 from nesy.errors import UserError
 from nesy.run_folder import atomic_path
-from planners.explicit.pomdp import TabularPOMDP
 from planners.explicit.pomdp_entries import Entries, expected_reward, transition_matrices
 from planners.explicit.pomdp_tokens import LARGEST, NUMBER, Scanner, decoded
+
+if TYPE_CHECKING:
+    from planners.explicit.pomdp import TabularPOMDP
 
 _KINDS = ("states", "actions", "observations")
 _PREAMBLE = ("discount", "values", *_KINDS, "start")
@@ -50,8 +53,8 @@ def unescape(word: str) -> str:
     )
 
 
-def read(path: Path) -> TabularPOMDP:
-    """Read a model.
+def read(path: Path) -> dict[str, Any]:
+    """Read a model: the arguments of `TabularPOMDP`.
 
     Raises:
         UserError: the file is missing, or a line is not understood; the message names the line.
@@ -106,7 +109,7 @@ class _Reader(Scanner):
             return self.which(kind)
         raise self.fail(f"unknown {kind[:-1]} '{token}'")
 
-    def model(self) -> TabularPOMDP:
+    def model(self) -> dict[str, Any]:
         self.preamble()
         sizes = [len(self.names[kind]) for kind in _KINDS]
         num_states, num_actions, num_observations = sizes
@@ -134,20 +137,17 @@ class _Reader(Scanner):
         reward = self.sign * expected_reward(rewards, matrices, observation) + 0.0
         stays = np.all([m.diagonal() > 1 - 1e-12 for m in matrices], axis=0)
         assert self.start is not None
-        try:
-            return TabularPOMDP(
-                states=states,
-                actions=actions,
-                observations=observations,
-                transition=matrices,
-                observation=observation,
-                reward=reward,
-                discount=self.discount,
-                start=self.start / self.start.sum() if abs(self.start.sum() - 1) <= _ROUNDING else self.start,
-                terminal=stays & (reward == 0).all(axis=0),
-            )
-        except UserError as error:
-            raise UserError(f"{self.name}: {error}") from None
+        return {
+            "states": states,
+            "actions": actions,
+            "observations": observations,
+            "transition": matrices,
+            "observation": observation,
+            "reward": reward,
+            "discount": self.discount,
+            "start": self.start / self.start.sum() if abs(self.start.sum() - 1) <= _ROUNDING else self.start,
+            "terminal": stays & (reward == 0).all(axis=0),
+        }
 
     def preamble(self) -> None:
         given = set()
