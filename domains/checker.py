@@ -40,6 +40,9 @@ def check_domain(domain: Domain, num_envs: int = 8, steps: int = 300, seed: int 
     _require(bool(spec.name) and spec.name.isidentifier(), f"spec.name must be an identifier, got '{spec.name}'")
     _require(len(spec.variants) > 0, "spec.variants must name at least one variant")
     _require(len(spec.tasks) > 0, "spec.tasks must name at least one task")
+    for variant, discount in spec.discounts.items():
+        _require(variant in spec.variants, f"spec.discounts names the unknown variant '{variant}'")
+        _require(0.0 <= discount < 1.0, f"spec.discounts: variant '{variant}' must have one in [0, 1), got {discount}")
     episodes, outcomes = 0, dict.fromkeys(OUTCOMES[1:], 0)
     for task in spec.tasks:
         for variant in spec.variants:

@@ -38,6 +38,8 @@ OUTCOMES = ("", "success", "agent_at_goal", "lost", "unescorted", "timeout")
 Task: TypeAlias = Literal["crossing", "following"]
 
 
+DISCOUNT = 0.9
+"""Discount per step where a variant names none of its own."""
 MOST_MAPS = 5_000
 """Of more maps than these nothing is worked out map by map: `occluded` has 51,520, with 76 million steps."""
 
@@ -116,6 +118,12 @@ class DomainSpec:
     cell_kinds: tuple[str, ...] = CELL_KINDS
     tasks: tuple[str, ...] = ("crossing", "following")
     outcomes: tuple[str, ...] = OUTCOMES
+    discounts: Mapping[str, float] = field(default_factory=dict, hash=False)
+    """Discount per step of each variant that does not have the usual one; ask `discount`."""
+
+    def discount(self, variant: str) -> float:
+        """Discount per step of a variant: the one place that oracles, learners, planners and evaluation ask."""
+        return self.discounts.get(variant, DISCOUNT)
 
     @property
     def num_cell_kinds(self) -> int:
@@ -310,15 +318,17 @@ class Domain(Protocol):
         """
         ...
 
-    def optimum(self, variant: str = "paper", discount: float = 0.9, **parameters: Any) -> OracleResult:
+    def optimum(self, variant: str = "paper", discount: float | None = None, **parameters: Any) -> OracleResult:
         """The exact full-state optimum over the maps of `maps(variant, **parameters)`.
+
+        `discount` of this and the other oracles: by default that of the variant, `spec.discount(variant)`.
 
         Raises:
             DomainError: there is no exact optimum, or too many maps for it.
         """
         ...
 
-    def bayes_optimum(self, variant: str = "paper", discount: float = 0.9, **parameters: Any) -> OracleResult:
+    def bayes_optimum(self, variant: str = "paper", discount: float | None = None, **parameters: Any) -> OracleResult:
         """The exact optimum of an agent that knows the set of worlds, and sees only its observations.
 
         Raises:
@@ -326,7 +336,9 @@ class Domain(Protocol):
         """
         ...
 
-    def egocentric_optimum(self, variant: str = "paper", discount: float = 0.9, **parameters: Any) -> OracleResult:
+    def egocentric_optimum(
+        self, variant: str = "paper", discount: float | None = None, **parameters: Any
+    ) -> OracleResult:
         """What the Bayes optimum becomes when the agent takes the person to know what is really so.
 
         The same information and the same planning, with a model of the person in which nobody is ever mistaken;

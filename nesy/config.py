@@ -15,7 +15,7 @@ def check_ranges(config: Any, section: str, **intervals: str) -> None:
     """Refuse settings outside their intervals, written as in mathematics: `[0, 1)`, `(0, inf)`.
 
     Args:
-        config: holds the settings, numbers or tuples of numbers.
+        config: holds the settings, numbers or tuples of numbers, or None for what is left open.
         section: of the configuration, for the message.
         intervals: for each setting.
 
@@ -23,6 +23,8 @@ def check_ranges(config: Any, section: str, **intervals: str) -> None:
         UserError: a number lies outside, or is none.
     """
     for name, interval in intervals.items():
+        if getattr(config, name) is None:
+            continue
         low, high = (float(bound) for bound in interval[1:-1].split(","))
         setting = getattr(config, name)
         for value in setting if isinstance(setting, tuple) else (setting,):

@@ -6,6 +6,7 @@ Nothing in a run folder is ever executed or unpickled, so a folder from a strang
 from __future__ import annotations
 
 import fcntl
+import filecmp
 import json
 import os
 import re
@@ -30,13 +31,15 @@ def atomic_path(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; rename it to `path` when the block ends without an exception.
 
     A reader sees the old file or the new one, never a half-written one; after an exception the old file
-    stays and the temporary one is removed.
+    stays and the temporary one is removed. A file that would stay as it is, byte by byte, is not touched.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
         yield temporary
+        if path.is_file() and filecmp.cmp(temporary, path, shallow=False):
+            return
         temporary.chmod(_FILE_MODE)
         with temporary.open("rb") as stream:
             os.fsync(stream.fileno())

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from domains.core import DISCOUNT
 from nesy.config import check_ranges
 from nesy.errors import UserError
 from nesy.perspective.influence import INFLUENCE_MODES
@@ -49,8 +50,8 @@ class DQNConfig:
     """Transitions in one update."""
     memory: int = 60_000
     """Transitions kept for replay."""
-    discount: float = 0.9
-    """Discount per step."""
+    discount: float | None = None
+    """Discount per step; left out: as the variant says."""
     n_step: int = 3
     """Steps of reward before the value estimate takes over."""
     warm_up: int = 2000
@@ -106,6 +107,15 @@ class DQNConfig:
             **dict.fromkeys(shares, "[0, 1]"),
         )
 
+    @property
+    def per_step(self) -> float:
+        """Discount per step; outside of any variant the usual one."""
+        return DISCOUNT if self.discount is None else self.discount
+
+    def at(self, discount: float) -> DQNConfig:
+        """These settings with the discount of a variant, unless they have one of their own."""
+        return self if self.discount is not None else replace(self, discount=discount)
+
     @classmethod
     def paper(cls, episodes: int = 10_000) -> DQNConfig:
         """The settings of the paper: one environment, one update per step."""
@@ -119,7 +129,6 @@ class DQNConfig:
             final_learning_rate=1e-3,
             batch_size=64,
             memory=60_000,
-            discount=0.9,
             n_step=1,
             warm_up=1000,
             updates_per_step=1.0,
@@ -165,8 +174,8 @@ class SearchConfig:
     repeatable results)."""
     depth: int = 12
     """Deepest step looked ahead."""
-    discount: float = 0.9
-    """Discount per step."""
+    discount: float | None = None
+    """Discount per step; left out: as the variant says."""
     exploration: float = 10.0
     """Weight of the exploration term (UCB1), in units of reward."""
     particles: int = 400
@@ -177,8 +186,6 @@ class SearchConfig:
     """Steps of these episodes that are learned from; 0 for all."""
     practice_mixture: float = 0.3
     """Probability that the switching behaviour of these episodes acts at random."""
-    mind_discount: float = 0.99
-    """Discount per step where minds matter (several goals): what pays there pays late."""
     mind_depth: int = 25
     """Deepest step looked ahead there."""
     mind_exploration: float = 40.0
@@ -194,9 +201,18 @@ class SearchConfig:
             "search",
             **dict.fromkeys(sizes, "[1, inf)"),
             **dict.fromkeys(("time_limit", "exploration", "mind_exploration", "practice_steps"), "[0, inf)"),
-            **dict.fromkeys(("discount", "mind_discount"), "[0, 1)"),
+            discount="[0, 1)",
             practice_mixture="[0, 1]",
         )
+
+    @property
+    def per_step(self) -> float:
+        """Discount per step; outside of any variant the usual one."""
+        return DISCOUNT if self.discount is None else self.discount
+
+    def at(self, discount: float) -> SearchConfig:
+        """These settings with the discount of a variant, unless they have one of their own."""
+        return self if self.discount is not None else replace(self, discount=discount)
 
     def time_left(self, spent: float) -> float:
         """What is left for a search of a decision that has taken `spent` seconds already; 0 where there is no limit."""
@@ -267,6 +283,10 @@ class CompareConfig:
             planner_milliseconds="[0, inf)",
             learning_steps="[0, inf)",
         )
+
+    def at(self, discount: float) -> CompareConfig:
+        """These settings with the discount of a variant for all who learn or plan, unless they have their own."""
+        return replace(self, dqn=self.dqn.at(discount), search=self.search.at(discount))
 
     @property
     def dqn_of_cells(self) -> DQNConfig:

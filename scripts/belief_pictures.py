@@ -60,7 +60,8 @@ def played(folder: Path, variant: str, number: int, prior: str, seed: int) -> li
     codec, model = SymbolicCodec(load_world_model(run.world_model)), IALM.load(run.ialm)
     env: Any = domain.make("following", 1, variant=variant, seed=seed, maps=domain.maps(variant)[0][[number]])
     observation, _ = env.reset(seed=seed)
-    agent = PlanningAgent("search", model, replace(SearchConfig(), particles=1000), domain.spec.geometry, seed, prior)
+    config = replace(SearchConfig(), particles=1000).at(domain.spec.discount(variant))
+    agent = PlanningAgent("search", model, config, domain.spec.geometry, seed, prior)
     perception = Perception(codec, prior, np.random.default_rng([seed, 1]))
     moments: list[Moment] = []
     active, last = np.ones(1, np.bool_), None

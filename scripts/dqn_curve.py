@@ -24,11 +24,12 @@ import tyro
 
 from domains.core import load_domain
 from nesy.report.comparison_figures import save
+from nesy.report.text import interval
 from nesy.run_folder import RunFolder, read_json, write_json
 from planners.agents import DQNAgent
 from planners.comparison.evaluation import Player, evaluate
 from planners.comparison.grid import EVALUATION_SEED
-from planners.comparison.results import map_optimum
+from planners.comparison.optima import map_optimum
 from planners.comparison.statistics import over_seeds
 from planners.config import DQNConfig
 from planners.dqn.dqn import Training
@@ -134,7 +135,7 @@ def table(label: str, curve: dict[str, Any]) -> list[str]:
         means = [float(np.mean([row[name] for row in rows])) for name in ("steps", "updates", "seconds")]
         lines.append(
             f"| {rows[0]['episodes']} | {means[0]:,.0f} | {means[1]:,.0f} | {means[2]:.0f} | "
-            f"{value.mean:.1f} [{value.low:.1f}, {value.high:.1f}] | {share} |"
+            f"{interval(value.as_dict(), 1)} | {share} |"
         )
     if optimum is not None:
         arrived = [settled(rows, WITHIN * optimum) for rows in curve["per_seed"]]

@@ -142,11 +142,12 @@ def final_returns(output: RunFolder, options: Arguments) -> dict[str, Any]:
 
 
 def ranking(modes: dict[str, Any]) -> str:
-    """The modes from best to worst, `>` where the intervals do not overlap and `~` where they do."""
+    """The modes from best to worst, `>` where the intervals do not overlap and `~` where they do or there are none."""
     ordered = sorted(modes, key=lambda mode: -modes[mode]["return"]["mean"])
     text = ordered[0]
     for better, worse in pairwise(ordered):
-        apart = modes[better]["return"]["low"] > modes[worse]["return"]["high"]
+        low, high = modes[better]["return"]["low"], modes[worse]["return"]["high"]
+        apart = None not in (low, high) and low > high
         text += f" {'>' if apart else '~'} {worse}"
     return f"Final training episodes: {text}."
 

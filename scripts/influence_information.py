@@ -35,6 +35,7 @@ from torch import nn
 
 from domains.core import load_domain
 from nesy.perspective.operator import InfluenceBelief, PerspectiveShift
+from nesy.report.text import interval
 from nesy.run_folder import RunFolder, read_json, write_json
 from nesy.world_model import SymbolicCodec, load_world_model
 from planners.comparison.statistics import over_seeds
@@ -310,7 +311,7 @@ def learned(options: Arguments) -> dict[tuple[str, str], str]:
     for way, inputs in tasks:
         values = [kept[f"{way} / {inputs} / {options.episodes} episodes / seed {seed}"] for seed in options.seeds]
         spread = over_seeds(np.array(values), np.array(options.seeds), 0)
-        found[way, inputs] = f"{spread.mean:.1f} [{spread.low:.1f}, {spread.high:.1f}]"
+        found[way, inputs] = interval(spread.as_dict(), 1)
     return found
 
 

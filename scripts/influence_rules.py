@@ -108,9 +108,9 @@ def _returns(model: IALM, codec: SymbolicCodec, domain: Domain, options: Argumen
     return np.concatenate(parts)
 
 
-def _interval(values: np.ndarray, seed: int) -> dict[str, float]:
-    found = bootstrap(values, seed)
-    return {"mean": round(float(found.mean), 4), "low": round(float(found.low), 4), "high": round(float(found.high), 4)}
+def _interval(values: np.ndarray, seed: int) -> dict[str, float | None]:
+    found = bootstrap(values, seed).as_dict()
+    return {name: None if value is None else round(value, 4) for name, value in found.items()}
 
 
 if __name__ == "__main__":

@@ -80,7 +80,7 @@ def main() -> None:
             ("bayes-optimum", domain.bayes_optimum),
             ("egocentric-optimum", domain.egocentric_optimum),
         ):
-            found = solve(variant, discount=0.99)
+            found = solve(variant)
             add(name, found.map_return[None], found.map_success[None])
     print(table(rows, weights))
     if arguments.output is not None:

@@ -30,7 +30,7 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--variants", nargs="+", choices=sorted(INSTANCES), default=list(INSTANCES))
-    parser.add_argument("--discount", type=float, default=None, help="left out: 0.9 for paper, 0.99 for others")
+    parser.add_argument("--discount", type=float, default=None, help="left out: as the variant says")
     parser.add_argument("--max-beliefs", type=int, default=200_000, help="where each Bayes search stops")
     parser.add_argument("--json", type=Path, default=None, help="also write the rows to this file")
     arguments = parser.parse_args()
@@ -38,8 +38,7 @@ def main() -> None:
     print("| variant | worlds | " + " | ".join(name.replace("_", " ") for name in COLUMNS) + " |")
     print("| --- | --- |" + " --- |" * len(COLUMNS))
     for variant in arguments.variants:
-        discount = arguments.discount or (0.9 if variant == "paper" else 0.99)
-        row = oracle_row(variant, discount=discount, max_beliefs=arguments.max_beliefs, **INSTANCES[variant])
+        row = oracle_row(variant, discount=arguments.discount, max_beliefs=arguments.max_beliefs, **INSTANCES[variant])
         rows.append(row)
         cells = [_cell(row[name]) for name in COLUMNS]
         print(f"| {variant} {_changes(row['changes'])} | {row['worlds']} | " + " | ".join(cells) + " |", flush=True)

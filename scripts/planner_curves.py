@@ -84,7 +84,7 @@ def measure(
     from nesy.world_model import SymbolicCodec, load_world_model
 
     codec, model = SymbolicCodec(load_world_model(run.world_model)), IALM.load(run.ialm)
-    config = replace(SearchConfig(), simulations=budget)
+    config = replace(SearchConfig(), simulations=budget).at(domain.spec.discount(variant))
     agent = WatchedAgent("search", model, config, domain.spec.geometry, seed, prior)
     perception = Perception(codec, prior, np.random.default_rng([seed, 1]))
     columns = evaluate(domain, variant, Player(agent, perception), episodes, seed)

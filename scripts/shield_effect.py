@@ -187,9 +187,9 @@ def _paired(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return one[:count] - other[:count]
 
 
-def _interval(values: np.ndarray, seed: int) -> dict[str, float]:
-    found = bootstrap(values, seed)
-    return {"mean": round(float(found.mean), 4), "low": round(float(found.low), 4), "high": round(float(found.high), 4)}
+def _interval(values: np.ndarray, seed: int) -> dict[str, float | None]:
+    found = bootstrap(values, seed).as_dict()
+    return {name: None if value is None else round(value, 4) for name, value in found.items()}
 
 
 class _WatchedEnvironment:

@@ -13,14 +13,14 @@ from domains.person_following.experts import LastSeenFollower
 from domains.person_following.metrics import belief_metrics, episode_metrics
 from domains.person_following.oracles.enumeration import all_maps, all_transitions, all_views
 from domains.person_following.predicates import ViewPredicates
-from domains.person_following.variants import VARIANTS, Parameters, parameters_of
+from domains.person_following.variants import DISCOUNTS, VARIANTS, Parameters, parameters_of
 from domains.person_following.vector_env import PersonFollowingVectorEnv
 
 
 class PersonFollowing:
     """The domain of the paper and its variants."""
 
-    spec = DomainSpec(name="person_following", variants=tuple(VARIANTS))
+    spec = DomainSpec(name="person_following", variants=tuple(VARIANTS), discounts=DISCOUNTS)
 
     @property
     def predicates(self) -> ViewPredicates:
@@ -66,28 +66,34 @@ class PersonFollowing:
         grids, _ = _maps(variant, tuple(sorted(parameters.items())))
         return all_transitions(grids, parameters_of(variant, task, **parameters), following=task == "following")
 
-    def optimum(self, variant: str = "paper", discount: float = 0.9, **parameters: Any) -> OracleResult:
+    def optimum(self, variant: str = "paper", discount: float | None = None, **parameters: Any) -> OracleResult:
         """The exact full-state optimum over the maps of a variant, weighted as the generator draws them."""
         from domains.person_following.oracles.full_state import full_state_optimum
 
         grids, weights = _maps(variant, tuple(sorted(parameters.items())))
-        return full_state_optimum(grids, weights, parameters_of(variant, **parameters), discount)
+        rules = parameters_of(variant, **parameters)
+        return full_state_optimum(grids, weights, rules, self._discount(variant, discount))
 
-    def bayes_optimum(self, variant: str = "paper", discount: float = 0.9, **parameters: Any) -> OracleResult:
+    def bayes_optimum(self, variant: str = "paper", discount: float | None = None, **parameters: Any) -> OracleResult:
         """The exact optimum of an agent that knows the set of worlds, and sees only its observations."""
         from domains.person_following.oracles.history_policies import bayes_optimum
 
-        return bayes_optimum(*self._worlds_of(variant, parameters), discount)
+        return bayes_optimum(*self._worlds_of(variant, parameters), self._discount(variant, discount))
 
-    def egocentric_optimum(self, variant: str = "paper", discount: float = 0.9, **parameters: Any) -> OracleResult:
+    def egocentric_optimum(
+        self, variant: str = "paper", discount: float | None = None, **parameters: Any
+    ) -> OracleResult:
         """The same for an agent in whose model of the person nobody is ever mistaken, played in the true task."""
         from domains.person_following.oracles.history_policies import egocentric_optimum
 
-        return egocentric_optimum(*self._worlds_of(variant, parameters), discount)
+        return egocentric_optimum(*self._worlds_of(variant, parameters), self._discount(variant, discount))
 
     def last_seen_follower(self, num_envs: int, variant: str = "paper", **parameters: Any) -> LastSeenFollower:
         """A greedy follower of the person's last seen configuration, for B environments."""
         return LastSeenFollower(num_envs, parameters_of(variant, **parameters))
+
+    def _discount(self, variant: str, given: float | None) -> float:
+        return self.spec.discount(variant) if given is None else given
 
     @staticmethod
     def _worlds_of(

@@ -179,6 +179,8 @@ _INTENT = _OCCLUDED | {
     "max_steps": 60,
 }
 _FALSE_BELIEF = _INTENT | {"num_goals": 2, "goal_moves_at": 3, "max_lost": 3, "goal_patience": 4, "robot_rest": 5}
+DISCOUNTS = {"occluded": 0.99, "intent": 0.99, "false_belief": 0.99}
+"""Discounts per step of variants where what pays comes late; the others have the paper's, `domains.core.DISCOUNT`."""
 VARIANTS: dict[str, dict[str, Any]] = {
     "paper": {},
     "clean": _CLEAN,

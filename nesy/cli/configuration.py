@@ -81,6 +81,11 @@ def save(config: RunConfig, path: Path, versions: Mapping[str, str]) -> None:
     write_json(path, {"format": FORMAT, **dataclasses.asdict(config), "versions": dict(versions)})
 
 
+def versions(path: Path) -> dict[str, str]:
+    """The versions of the libraries that a config.json was written with."""
+    return dict(read_json(path).get("versions", {}))
+
+
 def load(path: Path) -> RunConfig:
     """Read config.json.
 

@@ -171,7 +171,10 @@ class Pipeline:
             self._check_unchanged(configuration.load(self.run.config))
         elif self.run.path.is_dir() and any(not item.name.startswith(".") for item in self.run.path.iterdir()):
             raise UserError(f"{self.run.path}: holds files but no config.json, so it is no run folder; name another")
-        configuration.save(self.config, self.run.config, _versions())
+        if not self.run.has("config"):
+            configuration.save(self.config, self.run.config, _versions())
+        elif configuration.load(self.run.config) != self.config:  # nothing has been done yet: versions stay
+            configuration.save(self.config, self.run.config, configuration.versions(self.run.config))
 
     def _check_unchanged(self, old: RunConfig) -> None:
         shared = ("domain", "variant", "seed")
@@ -203,15 +206,39 @@ class Pipeline:
         if self.run.summary.is_file():
             kept = {name: value for name, value in self.run.read_summary().items() if name not in gone}
             kept["timing"] = {name: value for name, value in kept.get("timing", {}).items() if name not in gone}
+            if "provenance" in kept:
+                steps_of = kept["provenance"].get("steps", {})
+                kept["provenance"]["steps"] = {name: value for name, value in steps_of.items() if name not in gone}
             write_json(self.run.summary, kept)
 
-    def _timed(self, step: str, work: Callable[[], Any]) -> Any:
+    def _timed(self, step: str, work: Callable[[], Any], leaves: str | None = None) -> Any:
+        """Do `work` and write down how long it took, and with which versions.
+
+        Args:
+            step: what the time is called.
+            work: does it.
+            leaves: the step of `OUTPUTS` whose files the work may find finished: where it changes none of them, it has
+                done nothing, and no record changes.
+        """
+        before = self._marks(leaves)
         started = time.perf_counter()
         value = work()
-        timing = self.run.read_summary().get("timing", {})
-        timing[step] = round(timing.get(step, 0.0) + time.perf_counter() - started, 3)
-        self.run.update_summary(timing=timing, provenance=self._provenance())
+        spent = time.perf_counter() - started
+        if leaves is not None and self._marks(leaves) == before:
+            return value
+        summary = self.run.read_summary()
+        timing = summary.get("timing", {})
+        timing[step] = round(timing.get(step, 0.0) + spent, 3)
+        made_with = {**summary.get("provenance", {}).get("steps", {}), step: _versions()}
+        self.run.update_summary(timing=timing, provenance={**self._provenance(), "steps": made_with})
+        configuration.save(self.config, self.run.config, _versions())
         return value
+
+    def _marks(self, step: str | None) -> dict[Path, tuple[int, int]]:
+        """Which files of a step there are, and as of when: size and time of change."""
+        places = [self.run.path / name for name in (OUTPUTS[step] if step else ())]
+        files = (path for place in places for path in ([place] if place.is_file() else place.rglob("*")))
+        return {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in files if path.is_file()}
 
     def _provenance(self) -> dict[str, Any]:
         return {
@@ -319,10 +346,11 @@ class Pipeline:
                 engine=engine,
                 address=address,
             ),
+            leaves="compare",
         )
         self.run.update_summary(comparison=cells)
         write_json(self.run.results / "comparison.json", cells)
-        self._timed("replays", self._record_replays)
+        self._timed("replays", self._record_replays, leaves="compare")
         return {"comparison": cells}
 
     def _record_replays(self) -> None:
@@ -336,8 +364,8 @@ class Pipeline:
         from nesy.report.page import write_report
 
         self.run.require("collect", "train", "extract", "compare")
-        self._timed("replays", self._record_replays)  # a run compared by an earlier version has none
-        path = self._timed("report", lambda: write_report(self.run, self.progress))
+        self._timed("replays", self._record_replays, leaves="compare")  # a run compared by an earlier version has none
+        path = self._timed("report", lambda: write_report(self.run, self.progress), leaves="report")
         return {"report": str(path)}
 
 

@@ -19,6 +19,8 @@ def print_comparison(cells: list[dict[str, Any]]) -> None:
     for row in text.comparison_rows(cells):
         table.add_row(*row)
     print_wide(table)
+    if note := text.shared_note(cells):
+        print(note)
 
 
 def print_wide(table: Table) -> None:

@@ -19,6 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from nesy.report.figures import PALETTE
+from nesy.report.text import shown
 from nesy.run_folder import atomic_path
 
 MORE = ("#7F5539", "#8A8A8A", "#6A4C93")
@@ -33,14 +34,18 @@ def save_figures(folder: Path, records: Sequence[dict[str, Any]], statistics: di
     if statistics["improvement"]:
         figures["improvement"] = improvement(statistics)
     if statistics["curves"]:
-        figures["learning"] = learning(statistics["curves"], optima(records))
+        figures["learning"] = learning(statistics["curves"], exact_optima(records))
     for name, figure in figures.items():
         save(figure, folder / name)
 
 
-def optima(records: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """Mean return of the exact optimum by variant, where it is among the agents compared."""
-    return {record["variant"]: record["return"]["mean"] for record in records if record["agent"] == "optimum"}
+def exact_optima(records: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """Mean return of the exact optimum over all worlds by variant, where it is among the agents compared."""
+    return {
+        record["variant"]: record["exact"]["return"] if "exact" in record else record["return"]["mean"]
+        for record in records
+        if record["agent"] == "optimum"
+    }
 
 
 def save(figure: Figure, path: Path) -> None:
@@ -52,7 +57,8 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def returns(records: Sequence[dict[str, Any]]) -> Figure:
-    """Mean return (circle) and interquartile mean (diamond) of every condition; exact optima as dotted lines."""
+    """Mean return (circle) and interquartile mean (diamond) of every condition; optima as dotted lines."""
+    records = [shown(record) for record in records]
     figure, axes = _axes(8, 0.34 * len(records) + 1.0)
     colours = _colours([record["agent"] for record in records])
     for row, record in enumerate(records):
@@ -61,13 +67,14 @@ def returns(records: Sequence[dict[str, Any]]) -> Figure:
             if interval.get("low") is not None:
                 axes.plot([interval["low"], interval["high"]], [row + shift] * 2, color=colour, linewidth=1.5)
             axes.plot(interval["mean"], row + shift, mark, color=colour, markersize=4)
-    for variant, optimum in optima(records).items():
+    optima = {record["variant"]: record["return"]["mean"] for record in records if record["agent"] == "optimum"}
+    for variant, optimum in optima.items():
         rows = [row for row, record in enumerate(records) if record["variant"] == variant]
         axes.plot([optimum] * 2, [min(rows) - 0.5, max(rows) + 0.5], color="#000000", linestyle=":", linewidth=1)
     labels = [f"{_name(record)}  ({_counted(len(record['seeds']), record['episodes'])})" for record in records]
     axes.set_yticks(range(len(records)), labels, fontsize=8)
     axes.set_ylim(len(records) - 0.4, -0.6)
-    axes.set_xlabel("return: mean (circle), interquartile mean (diamond), 95 % intervals;\ndotted: exact optimum")
+    axes.set_xlabel("return: mean (circle), interquartile mean (diamond), 95 % intervals;\ndotted: optimum")
     return figure
 
 

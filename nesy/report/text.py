@@ -18,10 +18,24 @@ COMPARISON_COLUMNS = (
 )
 
 
+def shown(cell: dict[str, Any]) -> dict[str, Any]:
+    """A record with the figures that tables show: of the episodes that all agents of its variant have played."""
+    return {**cell, **(cell.get("shared") or {})}
+
+
+def shared_note(cells: list[dict[str, Any]]) -> str:
+    """Which episodes the figures are of, where agents have played different ones; else empty."""
+    counts = {cell["variant"]: shown(cell)["episodes"] for cell in cells if cell.get("shared")}
+    if not counts:
+        return ""
+    episodes = ", ".join(f"{count} episodes of {variant}" for variant, count in counts.items())
+    return f"Figures are of the {episodes} that all agents have played; of all their episodes: results/comparison.csv."
+
+
 def comparison_rows(cells: list[dict[str, Any]]) -> list[tuple[str, ...]]:
     """One row of text per cell of the comparison, in the order of `COMPARISON_COLUMNS`."""
     rows: list[tuple[str, ...]] = []
-    for cell in cells:
+    for cell in map(shown, cells):
         share = cell.get("share_of_optimum")
         rows.append(
             (
@@ -42,11 +56,11 @@ def comparison_rows(cells: list[dict[str, Any]]) -> list[tuple[str, ...]]:
     return rows
 
 
-def interval(figure: dict[str, float], digits: int) -> str:
-    """`mean [low, high]`, or the mean alone where it is exact."""
+def interval(figure: dict[str, Any], digits: int) -> str:
+    """`mean [low, high]`; `mean (exact)` where it is worked out, `mean [-]` where there is no interval."""
     mean, low, high = figure["mean"], figure.get("low"), figure.get("high")
     if low is None or high is None:
-        return f"{mean:.{digits}f} (exact)"
+        return f"{mean:.{digits}f} {'(exact)' if figure.get('exact') else '[-]'}"
     return f"{mean:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 

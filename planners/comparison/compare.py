@@ -21,7 +21,8 @@ from planners import config as settings
 from planners.comparison.engines.dispatch import run_cells
 from planners.comparison.grid import Cell, cell_path, episodes_evaluated, grid
 from planners.comparison.model_store import ModelStore
-from planners.comparison.results import map_optimum, write_results
+from planners.comparison.optima import count_maps, map_optimum
+from planners.comparison.results import write_results
 from planners.comparison.run_cell import OUT_OF_REACH, result_of
 from planners.config import CompareConfig
 
@@ -59,7 +60,8 @@ def compare(
         planning = {cell.agent for cell in cells if cell.variant == variant} & set(settings.PLANNING_AGENTS)
         if planning:
             store.learn(domain, variant, config.search_of_cells, seed, "structured" in planning, progress)
-    missing = [cell for cell in cells if result_of(run, config, cell, seed) is None]
+    told = {variant: config.at(domain.spec.discount(variant)) for variant in config.variants}
+    missing = [cell for cell in cells if result_of(run, told[cell.variant], cell, seed) is None]
     total = sum(_episodes(config, cell) for cell in missing)
     with progress.task("compare", total) as task:
         run_cells([(cell, run.path, config, seed, domain_name) for cell in missing], jobs, task, engine, address)
@@ -74,7 +76,8 @@ def compare(
     with atomic_path(run.results / "episodes.parquet") as temporary:
         pq.write_table(whole, temporary, compression="zstd")
     optima = {variant: map_optimum(run.results, domain, variant) for variant in config.variants}
-    return write_results(run.results, whole, config, optima, left_out)
+    maps = {variant: count_maps(domain, variant) for variant in config.variants}
+    return write_results(run.results, whole, config, optima, left_out, maps)
 
 
 def _report_influence_rules(run: RunFolder, config: CompareConfig, domain: Domain, cells: list[Cell]) -> None:

@@ -18,6 +18,7 @@ from planners.perception import Codec, Perception, Percepts
 from planners.shielding import ActionMask
 
 Columns = dict[str, np.ndarray]
+GOLDEN_RATIO = (5**0.5 - 1) / 2
 UNTIMED = 2
 """Decisions at the start of an episode that are not timed: they load what is compiled, for beliefs and their update."""
 
@@ -25,7 +26,9 @@ UNTIMED = 2
 def evaluation_maps(domain: Domain, variant: str, episodes: int) -> np.ndarray | None:
     """The start map of every episode, [episodes, size, size]; None where the maps cannot be listed.
 
-    Listed maps are taken in turn where the generator draws them equally often, and otherwise in proportion.
+    Listed maps are taken in turn where the generator draws them equally often, and otherwise in proportion, by a
+    sequence that spreads evenly however far it goes (multiples of the golden ratio): the first n of a greater number
+    of episodes are played on the maps of n.
     """
     try:
         grids, weights = domain.maps(variant)
@@ -34,7 +37,8 @@ def evaluation_maps(domain: Domain, variant: str, episodes: int) -> np.ndarray |
     if np.allclose(weights, weights[0]):
         return np.asarray(grids[np.arange(episodes) % len(grids)])
     ends = np.cumsum(weights) / np.sum(weights)
-    return np.asarray(grids[np.searchsorted(ends, (np.arange(episodes) + 0.5) / episodes).clip(0, len(grids) - 1)])
+    places = (0.5 + np.arange(episodes) * GOLDEN_RATIO) % 1.0
+    return np.asarray(grids[np.searchsorted(ends, places).clip(0, len(grids) - 1)])
 
 
 class Player:
@@ -126,7 +130,7 @@ def evaluate(
         ended = active & (np.asarray(terminated) | np.asarray(truncated))
         outcome[ended] = np.asarray(infos["outcome_code"])[ended]
         active = active & ~ended
-        factor *= 0.9
+        factor *= domain.spec.discount(variant)
         last = actions
         if ended.any():
             advance(int(ended.sum()))

@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from planners.comparison.statistics import Interval, probability_of_improvement
+from planners.comparison.chance import Interval, drawn
+from planners.comparison.statistics import holding, probability_of_improvement
 
 
 class Played(NamedTuple):
@@ -30,12 +31,18 @@ class Played(NamedTuple):
 
 
 def improvement(
-    ours: Played, theirs: Played, seed: int, confidence: float = 0.95, resamples: int = 200
+    ours: Played,
+    theirs: Played,
+    seed: int,
+    confidence: float = 0.95,
+    resamples: int = 200,
+    sampled: bool = False,
 ) -> tuple[Interval, int]:
     """The probability with its percentile bootstrap interval, and on how many maps it rests.
 
-    Resampled are trainings, where there are any; else episodes within each map; and where maps come but once, maps.
-    Agents that have met no map in common are compared regardless of maps (0 maps).
+    Resampled are trainings, where there are any; episodes within each map, or, where maps come but once or are a
+    sample (`sampled`), maps: the wider of both. Agents that have met no map in common are compared regardless of maps
+    (0 maps).
     """
     common = np.intersect1d(ours.maps, theirs.maps)
     if not len(common):
@@ -46,25 +53,24 @@ def improvement(
     wins = [np.sign(ours.returns[i][:, None] - theirs.returns[j][None, :]) / 2 + 0.5 for i, j in at]
     mean = float(weights @ [part.mean() for part in wins])
     rng = np.random.default_rng(seed)
-    if ours.trainings is not None or theirs.trainings is not None:
-        draws = _over_trainings(ours, theirs, at, weights, wins, rng, resamples)
-    elif min(min(part.shape) for part in wins) > 1:
-        draws = np.zeros(resamples)
+    if not sampled and min(min(part.shape) for part in wins) > 1:
+        draws = np.zeros((1, resamples))
         for weight, part in zip(weights, wins, strict=True):
             rows, columns = (_drawn(rng, count, resamples) for count in part.shape)
             draws += weight * ((rows @ part) * columns).sum(axis=1)
     else:
         chosen = rng.multinomial(len(common), weights, resamples) / len(common)
-        draws = chosen @ [part.mean() for part in wins]
+        draws = (chosen @ [part.mean() for part in wins])[None]
+    if ours.trainings is not None or theirs.trainings is not None:
+        draws = np.stack([*draws, _over_trainings(ours, theirs, at, weights, wins, rng, resamples)])
     tail = (1.0 - confidence) / 2
-    low, high = np.quantile(draws, [tail, 1.0 - tail])
-    found = np.round([mean, low, high], 12)  # sums of weights: exactly 0.5 and 1 are to stay so
-    return Interval(*found.tolist()), len(common)
+    low, high = np.quantile(draws, [tail, 1.0 - tail], axis=1)
+    return holding(mean, low.min(), high.max()), len(common)
 
 
 def _drawn(rng: np.random.Generator, count: int, resamples: int) -> np.ndarray:
     """Shares of `count` things in each resample: float64 [resamples, count]."""
-    return rng.multinomial(count, np.full(count, 1 / count), resamples) / count
+    return drawn(rng, count, resamples) / count
 
 
 def _over_trainings(

@@ -116,6 +116,7 @@ class ModelStore:
         Raises:
             UserError: the practice has fewer steps than are to be learned from.
         """
+        config = config.at(domain.spec.discount(variant))
         collected = {
             "variant": variant,
             "seed": seed,
@@ -123,8 +124,8 @@ class ModelStore:
             "practice_mixture": config.practice_mixture,
         }
         learned_from = {**collected, "practice_steps": config.practice_steps}
-        tables = {**learned_from, "discount": config.discount, "tables": TABLES_VERSION}
-        scenes = {**learned_from, "discount": config.mind_discount, "structured": STRUCTURED_VERSION}
+        tables = {**learned_from, "discount": config.per_step, "tables": TABLES_VERSION}
+        scenes = {**learned_from, "discount": config.per_step, "structured": STRUCTURED_VERSION}
         home = self.folder(variant)
         before = _provenance(home / "model.json")
         wanted = before != tables, structured and _provenance(home / "structured" / "kind.json") != scenes
@@ -143,7 +144,7 @@ class ModelStore:
         if wanted[1]:
             self._learn_structured(here[0] if here else None, scenes, home / "structured")
         if wanted[0]:
-            learn_ialm(self.dbn, self.codec, experience, tables, config.discount).save(home)
+            learn_ialm(self.dbn, self.codec, experience, tables, config.per_step).save(home)
 
     def _learn_structured(self, experience: Experience | None, provenance: dict[str, Any], folder: Path) -> None:
         """The model of the kind that the experience asks for; which one that is stands in `kind.json`, written last."""

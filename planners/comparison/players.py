@@ -51,6 +51,7 @@ def build_player(
 ) -> Built:
     """The cell's player; a learner is trained, from `checkpoint` on where that file is."""
     own_seed, store = cell_seed(cell, seed), ModelStore(run)
+    config = config.at(domain.spec.discount(cell.variant))
     if cell.agent in settings.REFERENCE_AGENTS:
         agent = _reference(cell, domain, own_seed)
         if not config.rules:

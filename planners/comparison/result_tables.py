@@ -2,6 +2,10 @@
 
 comparison   one row per agent and condition: all figures (.parquet, .csv), the main ones (.md, .tex)
 measures     every metric of docs/metrics.md with its interval, a few to a table (.md, .tex)
+
+What people read (.md, .tex) shows every agent on the episodes that all agents of its variant have played; data files
+have the figures of all episodes too, and those of the shared ones under `shared`.
+
 regret       one row per agent, condition and map (.parquet, .csv)
 """
 
@@ -15,12 +19,12 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from nesy.report.text import COMPARISON_COLUMNS, comparison_rows, interval, number
+from nesy.report.text import COMPARISON_COLUMNS, comparison_rows, interval, number, shown
 from nesy.run_folder import atomic_path
 
 ACROSS = 5
 """Metrics side by side in one table."""
-SUMMED_UP = ("return", "interquartile_mean", "success", "regret")
+SUMMED_UP = ("return", "interquartile_mean", "success", "regret", "behind_bayes_optimum")
 """Figures of a record that have an interval of their own."""
 
 
@@ -41,7 +45,7 @@ def write_tables(folder: Path, records: Sequence[dict[str, Any]], regrets: Seque
             writer.writeheader()
             writer.writerows(rows)
     main = [(COMPARISON_COLUMNS, comparison_rows(list(records)))]
-    for name, tables in (("comparison", main), ("measures", _measures(records))):
+    for name, tables in (("comparison", main), ("measures", _measures([shown(record) for record in records]))):
         for ending, text in (("md", _markdown), ("tex", _latex)):
             with atomic_path(folder / f"{name}.{ending}") as temporary:
                 temporary.write_text("\n".join(text(columns, rows) for columns, rows in tables), encoding="utf-8")
@@ -55,6 +59,8 @@ def _flat(record: dict[str, Any]) -> dict[str, Any]:
             for metric, mean in value.items():
                 low, high = record["metric_intervals"][metric]
                 row |= {f"metrics.{metric}": mean, f"metrics.{metric}.low": low, f"metrics.{metric}.high": high}
+        elif name == "shared":
+            row |= {f"shared.{inner}": figure for inner, figure in _flat(value).items()}
         elif isinstance(value, dict) and name != "metric_intervals":
             row |= {f"{name}.{inner}": figure for inner, figure in value.items()}
         elif name != "metric_intervals":
@@ -79,12 +85,12 @@ def _measure_row(record: dict[str, Any], names: Sequence[str]) -> tuple[str, ...
 def _measure(record: dict[str, Any], name: str) -> str:
     """`mean [low, high]`, empty where this record has no such figure."""
     if name in SUMMED_UP:
-        return "" if record[name] is None else interval(record[name], 3 if name == "success" else 1)
+        return "" if record.get(name) is None else interval(record[name], 3 if name == "success" else 1)
     if name not in record["metrics"]:
         return ""
     figures = (record["metrics"][name], *record["metric_intervals"][name])
-    mean, low, high = (number(float(f"{figure:.3g}")) for figure in figures)
-    return f"{mean} [{low}, {high}]"
+    mean, low, high = ("" if figure is None else number(float(f"{figure:.3g}")) for figure in figures)
+    return f"{mean} [{low}, {high}]" if low else f"{mean} [-]"
 
 
 def _markdown(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -3,9 +3,12 @@
 episodes (all seeds pooled) -> records (means, interquartile means, intervals, regret, share of the optimum)
                             -> tables (planners.comparison.result_tables), statistics.json, plots
 
-Intervals: over whole maps where there are more than anybody could play (those played are a sample); else stratified by
-map where maps come more than once, since every agent meets the same ones; where each comes once, of what the optimum
-there does not explain (a control variate); for agents that learn, with three seeds or more, over seeds, since the
+Where agents of a variant have played different numbers of episodes, records hold their figures twice: of all that an
+agent has played, and, as `shared`, of the episodes that all have played, which tables and figures show.
+
+Intervals (planners.comparison.chance): over maps where there are more than have been played (a sample then); else
+within maps where they come more than once, since every agent meets the same ones; where each comes once, of what the
+optimum there does not explain (a control variate); for agents that learn, with two seeds or more, over seeds, since the
 episodes of one training have that training in common. Shares of the optimum are of what it gets in the same episodes:
 on the same maps, or, where a map says too little (who knows which goal is meant), when it plays.
 """
@@ -20,24 +23,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from domains.core import Domain, DomainError
-from nesy.run_folder import read_json, write_json
+from nesy.run_folder import write_json
+from planners.comparison.chance import Chance, Interval, drawn, share_interval
 from planners.comparison.improvement import Played, improvement
-from planners.comparison.statistics import (
-    Interval,
-    bootstrap,
-    cluster_bootstrap,
-    interquartile_mean,
-    means_with_intervals,
-    over_seeds,
-    performance_profile,
-    running_average,
-    stratified_bootstrap,
-)
-from planners.config import ORACLES, PLANNING_AGENTS, CompareConfig
+from planners.comparison.optima import Optimum, is_optimum
+from planners.comparison.statistics import performance_profile, running_average
+from planners.config import ORACLES, PLANNING_AGENTS, REFERENCE_AGENTS, CompareConfig
 
-Optimum = dict[str, Any]
-"""`mean_return`, `success`, and, where maps can be listed, `maps`: [{map_id, return, success}]."""
 CONDITION = ("agent", "inputs", "influence", "variant")
 METRICS_OF_NO_EPISODE = ("seed", "phase", "episode", "outcome", "map_id", "step", "experience_steps", *CONDITION)
 MOST_POINTS = 400
@@ -50,70 +42,42 @@ def write_results(
     config: CompareConfig,
     optima: dict[str, Optimum | None],
     left_out: dict[str, str] | None = None,
+    maps: dict[str, int] | None = None,
 ) -> list[dict[str, Any]]:
     """Sum up and write every table; returns the `comparison` list of summary.json.
 
-    `left_out` says what has no episodes, and why.
+    Args:
+        folder: of the results.
+        episodes: all of them, as results/episodes.parquet has them.
+        config: of the comparison.
+        optima: by variant, as of `map_optimum`.
+        left_out: what has no episodes, and why.
+        maps: by variant, as of `count_maps`.
     """
     from nesy.report.comparison_figures import save_figures
     from planners.comparison.result_tables import write_tables
 
     played = _groups(episodes, "eval")
-    peers = {condition[3]: rows for condition, rows in played.items() if condition[0] == "optimum"}
-    records = [
-        _record(condition, rows, config, optima.get(condition[3]), peers.get(condition[3]))
-        for condition, rows in played.items()
-    ]
+    shared, counted = _shared(played), maps or {}
+    peers = {(condition[0], condition[3]): rows for condition, rows in played.items() if condition[0] in ORACLES}
+    records = []
+    for condition, rows in played.items():
+        variant = condition[3]
+        optimum, bayes = peers.get(("optimum", variant)), peers.get(("bayes-optimum", variant))
+        theirs = (optima.get(variant), optimum, bayes, counted.get(variant), shared.get(condition))
+        records.append(_record(condition, rows, config, *theirs))
     regrets = [row for condition, rows in played.items() for row in _regrets(condition, rows, optima)]
     statistics = {
         "confidence": config.confidence,
         "left_out": left_out or {},
-        "profiles": _profiles(played),
-        "improvement": _improvements(played, config),
+        "profiles": _profiles(played | shared),
+        "improvement": _improvements(played | shared, config, optima, counted),
         "curves": [_curve(condition, rows, config) for condition, rows in _groups(episodes, "train").items()],
     }
     write_tables(folder, records, regrets)
     write_json(folder / "statistics.json", statistics)
     save_figures(folder / "plots", records, statistics)
     return records
-
-
-def map_optimum(folder: Path, domain: Domain, variant: str) -> Optimum | None:
-    """Return and success of the exact optimum, by map too; worked out once and kept. None where it is out of reach."""
-    path = folder / f"optimum-{variant}.json"
-    if path.is_file() and _is_optimum(kept := read_json(path)):
-        return dict(kept)
-    try:
-        oracle = domain.optimum(variant)
-        grids, _ = domain.maps(variant)
-    except DomainError:
-        return None
-    maps = []
-    if len(grids) == len(oracle.map_return):
-        env: Any = domain.make("following", len(grids), variant=variant, seed=0, maps=grids, cycle=True)
-        env.reset(seed=0)
-        maps = [
-            {"map_id": int(name), "return": float(value), "success": float(success)}
-            for name, value, success in zip(env.map_ids(), oracle.map_return, oracle.map_success, strict=True)
-        ]
-        env.close()
-    value = {"mean_return": oracle.mean_return, "success": oracle.success, "maps": maps}
-    write_json(path, value)
-    return value
-
-
-def _is_optimum(value: Any) -> bool:
-    """Whether a file holds what `map_optimum` writes; else it is worked out again."""
-    return (
-        isinstance(value, dict)
-        and all(isinstance(value.get(key), int | float) for key in ("mean_return", "success"))
-        and isinstance(value.get("maps"), list)
-        and all(
-            isinstance(entry, dict)
-            and all(isinstance(entry.get(k), int | float) for k in ("map_id", "return", "success"))
-            for entry in value["maps"]
-        )
-    )
 
 
 def _groups(episodes: pa.Table, phase: str) -> dict[tuple[str, ...], dict[str, np.ndarray]]:
@@ -134,6 +98,7 @@ def _interval(
     robust: bool = False,
     best: np.ndarray | None = None,
     sampled: bool = False,
+    chance: Chance | None = None,
 ) -> Interval:
     """Mean (or interquartile mean) of `values`.
 
@@ -144,23 +109,40 @@ def _interval(
         robust: the interquartile mean.
         best: what the optimum gets in each of these episodes.
         sampled: whether the maps are a sample of many.
+        chance: of these rows, where it has been resampled already.
     """
-    if _over_seeds(rows) and not robust:
-        return over_seeds(values, rows["seed"], 0, config.confidence)
-    statistic = interquartile_mean if robust else np.mean
-    if sampled:
-        return cluster_bootstrap(values, rows["map_id"], 0, config.confidence, statistic)
-    if np.unique(rows["map_id"], return_counts=True)[1].min() >= 2:
-        return stratified_bootstrap(values, rows["map_id"], 0, config.confidence, statistic)
-    if best is None or robust:  # nothing to resample within a map
-        return bootstrap(values, 0, config.confidence, statistic)
-    return bootstrap(values - _explained(values, best), 0, config.confidence)
+    chance = chance or _chance(rows, config, sampled)
+    if robust:
+        return chance.interquartile_mean(values)
+    once = not sampled and _strata(rows) is None  # nothing to resample within a map
+    return chance.mean(values, explained=_explained(values, best) if once and best is not None else None)
+
+
+def _chance(rows: dict[str, np.ndarray], config: CompareConfig, sampled: bool) -> Chance:
+    """What is chance in these episodes; `sampled`: whether their maps are a sample of many."""
+    trainings = rows["seed"] if _over_seeds(rows) else None
+    maps, strata = (rows["map_id"], None) if sampled else (None, _strata(rows))
+    return Chance(len(rows["map_id"]), trainings, maps, strata, config.confidence)
+
+
+def _strata(rows: dict[str, np.ndarray]) -> np.ndarray | None:
+    """The maps, where each has been played more than once."""
+    return rows["map_id"] if np.unique(rows["map_id"], return_counts=True)[1].min() > 1 else None
+
+
+def _sampled(rows: dict[str, np.ndarray], optimum: Optimum | None, maps: int | None) -> bool:
+    """Whether there are more maps than have been played: of `maps`, or, where nobody says how many, by the optimum,
+    which lists them, and is out of reach where there are too many.
+    """  # noqa: D205
+    if maps is None and (optimum is None or not optimum["maps"]):
+        return optimum is None
+    return len(np.unique(rows["map_id"])) < (len(optimum["maps"]) if maps is None and optimum else maps or np.inf)
 
 
 def _over_seeds(rows: dict[str, np.ndarray]) -> bool:
     """Whether these are several trainings. Planners' seeds are none: all plan with the same learned model."""
     learned = rows["experience_steps"].max() > 0 and rows["agent"][0] not in PLANNING_AGENTS
-    return bool(learned and len(np.unique(rows["seed"])) >= 3)
+    return bool(learned and len(np.unique(rows["seed"])) > 1)
 
 
 def _explained(values: np.ndarray, best: np.ndarray) -> np.ndarray:
@@ -177,43 +159,82 @@ def _record(
     config: CompareConfig,
     optimum: Optimum | None,
     peer: dict[str, np.ndarray] | None,
+    bayes: dict[str, np.ndarray] | None = None,
+    maps: int | None = None,
+    shared: dict[str, np.ndarray] | None = None,
 ) -> dict[str, Any]:
-    returns, success = rows["return"], (rows["outcome"] == "success").astype(np.float64)
-    sampled = optimum is None  # it is out of reach where there are too many maps
-    best = _best(rows, optimum, peer, "return")
-    mean_return = _interval(returns, rows, config, best=best, sampled=sampled).as_dict()
-    best_success = _best(rows, optimum, peer, "success")
-    mean_success = _interval(success, rows, config, best=best_success, sampled=sampled).as_dict()
-    reference = optimum and optimum["mean_return"] if best is None else float(best.mean())
+    """One record.
+
+    Args:
+        condition: agent, inputs, influence, variant.
+        rows: its episodes.
+        config: of the comparison.
+        optimum: exact, as of `map_optimum`.
+        peer: the optimum's own episodes.
+        bayes: those of the Bayes optimum.
+        maps: how many there are, 0 for too many to be listed; None where nobody says.
+        shared: those of the rows that every agent of the variant has played, where some have played others.
+    """
+    optimum = optimum if optimum is not None and is_optimum(optimum) else None
     record: dict[str, Any] = dict(zip(CONDITION, (str(part) for part in condition), strict=True))
-    if record["agent"] == "optimum" and optimum is not None:
-        mean_return, mean_success = _exact(optimum["mean_return"]), _exact(optimum["success"])
-        reference = optimum["mean_return"]
+    exact = optimum if record["agent"] == "optimum" and not config.rules else None
+    record |= _figures(rows, config, optimum, peer, bayes, maps, exact is not None)
+    record["experience_steps"] = int(rows["experience_steps"].max())
+    if exact is not None:
+        record["exact"] = {"return": exact["mean_return"], "success": exact["success"]}
+    if shared is not None:
+        record["shared"] = _figures(shared, config, optimum, peer, bayes, maps, exact is not None)
+    return record
+
+
+def _figures(
+    rows: dict[str, np.ndarray],
+    config: CompareConfig,
+    optimum: Optimum | None,
+    peer: dict[str, np.ndarray] | None,
+    bayes: dict[str, np.ndarray] | None,
+    maps: int | None,
+    exact: bool,
+) -> dict[str, Any]:
+    """Everything that is summed up of some episodes; `exact`: they are the optimum's, whose means are known by map."""
+    sampled = _sampled(rows, optimum, maps)
+    chance = _chance(rows, config, sampled)
+    alike = chance.repeats and rows["agent"][0] in REFERENCE_AGENTS and rows["agent"][0] != "random"
+
+    def mean(values: np.ndarray, best: np.ndarray | None = None, robust: bool = False) -> dict[str, Any]:
+        return _interval(values, rows, config, robust, best, sampled, chance).as_dict(alike)
+
+    returns, success = rows["return"], (rows["outcome"] == "success").astype(np.float64)
+    best, best_success = (_best(rows, optimum, peer, what) for what in ("return", "success"))
+    mean_return, mean_success = mean(returns, best), mean(success, best_success)
+    if exact and best is not None and best_success is not None and _by_map(rows, optimum) is not None:
+        mean_return, mean_success = _exact(best.mean()), _exact(best_success.mean())
+    reference = optimum and optimum["mean_return"] if best is None else float(best.mean())
     columns = {
         "steps" if name == "length" else name: column.astype(np.float64)
         for name, column in rows.items()
         if name not in METRICS_OF_NO_EPISODE and column.dtype.kind in "fi" and not np.isnan(column.astype(float)).all()
     }
-    groups = rows["seed"] if _over_seeds(rows) else rows["map_id"]
-    measured = means_with_intervals(columns, groups, sampled or _over_seeds(rows), 0, config.confidence)
+    measured = {name: found.as_dict(alike) for name, found in chance.means(columns).items()}
+    bayes_return = None if bayes is None or bayes["agent"][0] == rows["agent"][0] else _same(rows, bayes, "return")
     return {
-        **record,
         "seeds": [int(seed) for seed in np.unique(rows["seed"])],
         "episodes": len(returns),
+        "resampled": chance.resampled,
         "return": mean_return,
-        "interquartile_mean": _interval(returns, rows, config, robust=True, sampled=sampled).as_dict(),
+        "interquartile_mean": mean(returns, robust=True),
         "success": mean_success,
         "ms_per_decision": float(np.median(rows["ms_per_decision"])),
-        "experience_steps": int(rows["experience_steps"].max()),
-        "share_of_optimum": mean_return["mean"] / reference if reference else None,
-        "regret": None if best is None else _interval(best - returns, rows, config).as_dict(),
-        "metrics": {name: found.mean for name, found in measured.items()},
-        "metric_intervals": {name: [found.low, found.high] for name, found in measured.items()},
+        "share_of_optimum": mean_return["mean"] / reference if reference and reference > 0 else None,
+        "regret": None if best is None else mean(np.round(best - returns, 9)),
+        "behind_bayes_optimum": None if bayes_return is None else mean(np.round(bayes_return - returns, 9)),
+        "metrics": {name: found["mean"] for name, found in measured.items()},
+        "metric_intervals": {name: [found["low"], found["high"]] for name, found in measured.items()},
     }
 
 
 def _exact(value: float) -> dict[str, Any]:
-    return {"mean": value, "low": None, "high": None}
+    return {"mean": float(value), "low": None, "high": None, "exact": True}
 
 
 def _best(
@@ -226,12 +247,33 @@ def _best(
     known = _by_map(rows, optimum)
     if known is not None:
         return np.array([known[int(name)][what] for name in rows["map_id"]], np.float64)
-    if peer is None:
-        return None
+    return None if peer is None else _same(rows, peer, what)
+
+
+def _same(rows: dict[str, np.ndarray], peer: dict[str, np.ndarray], what: str) -> np.ndarray | None:
+    """`return` or `success` of a peer in each of these episodes; None where it has not played all of them."""
     values = peer["return"] if what == "return" else peer["outcome"] == "success"
-    same = dict(zip(zip(peer["seed"], peer["episode"], strict=True), values, strict=True))
-    keys = list(zip(rows["seed"], rows["episode"], strict=True))
+    same = dict(zip(_keys(peer), values, strict=True))
+    keys = _keys(rows)
     return np.array([same[key] for key in keys], np.float64) if all(key in same for key in keys) else None
+
+
+def _keys(rows: dict[str, np.ndarray]) -> list[tuple[int, ...]]:
+    """What tells the episodes of a variant apart, whoever plays them: they start alike and run on the same chance."""
+    return list(zip(*(rows[name].tolist() for name in ("seed", "episode", "map_id")), strict=True))
+
+
+def _shared(played: dict[tuple[str, ...], dict[str, np.ndarray]]) -> dict[tuple[str, ...], dict[str, np.ndarray]]:
+    """Of every condition the episodes that all agents of its variant have played, where some have played others."""
+    found = {}
+    for variant in {condition[3] for condition in played}:
+        keys = {condition: _keys(rows) for condition, rows in played.items() if condition[3] == variant}
+        common = set.intersection(*map(set, keys.values()))
+        if common and any(len(own) > len(common) for own in keys.values()):
+            for condition, own in keys.items():
+                here = np.array([key in common for key in own])
+                found[condition] = {name: column[here] for name, column in played[condition].items()}
+    return found
 
 
 def _by_map(rows: dict[str, np.ndarray], optimum: Optimum | None) -> dict[int, dict[str, Any]] | None:
@@ -286,17 +328,29 @@ def _profiles(played: dict[tuple[str, ...], dict[str, np.ndarray]]) -> dict[str,
     }
 
 
-def _improvements(played: dict[tuple[str, ...], dict[str, np.ndarray]], config: CompareConfig) -> list[dict[str, Any]]:
+def _improvements(
+    played: dict[tuple[str, ...], dict[str, np.ndarray]],
+    config: CompareConfig,
+    optima: dict[str, Optimum | None],
+    maps: dict[str, int],
+) -> list[dict[str, Any]]:
     """P(an episode of the one beats one of the other on the same map) for every pair of conditions of one variant."""
     conditions = [key for key in played if key[0] not in ORACLES]
     episodes = {key: _played(played[key]) for key in conditions}
     found = []
     for ours, theirs in combinations(conditions, 2):
         if ours[3] == theirs[3]:
-            p, maps = improvement(episodes[ours], episodes[theirs], 0, config.confidence)
-            there = {"ours": _name(ours), "theirs": _name(theirs), "maps": maps, **p.as_dict()}
-            back = {"mean": 1 - p.mean, "low": 1 - p.high, "high": 1 - p.low}
-            found += [there, {"ours": _name(theirs), "theirs": _name(ours), "maps": maps, **back}]
+            sampled = _sampled(played[ours], optima.get(ours[3]), maps.get(ours[3]))
+            p, common = improvement(episodes[ours], episodes[theirs], 0, config.confidence, sampled=sampled)
+            low, high = p.low, p.high
+            if low == high:  # of a share there is always an interval
+                fewer = min(len(episodes[key].returns) for key in (ours, theirs))
+                low, high = share_interval(p.mean, 0.0, fewer, config.confidence)
+            assert low is not None and high is not None
+            there = {"ours": _name(ours), "theirs": _name(theirs), "maps": common}
+            there |= {"mean": p.mean, "low": low, "high": high}
+            back = {"mean": 1 - p.mean, "low": 1 - high, "high": 1 - low}
+            found += [there, {"ours": _name(theirs), "theirs": _name(ours), "maps": common, **back}]
     order = {_name(key): at for at, key in enumerate(conditions)}
     return sorted(found, key=lambda pair: (order[pair["ours"]], order[pair["theirs"]]))
 
@@ -321,9 +375,10 @@ def _curve(condition: tuple[str, ...], rows: dict[str, np.ndarray], config: Comp
     curve["steps"] = np.mean([taken[at] for taken in steps], axis=0).tolist()
     for name, width in (("policy", window), ("running_average", None)):
         lines = np.array([running_average(returns[:length], width)[at] for returns in per_seed])
-        draws = np.random.default_rng(0).integers(len(seeds), size=(500, len(seeds)))
-        means = lines[draws].mean(axis=1)
-        tail = (1 - config.confidence) / 2
-        low, high = np.quantile(means, [tail, 1 - tail], axis=0)
-        curve[name] = {"mean": lines.mean(axis=0).tolist(), "low": low.tolist(), "high": high.tolist()}
+        curve[name] = {"mean": lines.mean(axis=0).tolist(), "low": None, "high": None}
+        if len(seeds) > 1:
+            means = drawn(np.random.default_rng(0), len(seeds), 500) @ lines / len(seeds)
+            tail = (1 - config.confidence) / 2
+            low, high = np.quantile(means, [tail, 1 - tail], axis=0)
+            curve[name] |= {"low": low.tolist(), "high": high.tolist()}
     return curve

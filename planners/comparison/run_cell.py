@@ -48,6 +48,7 @@ def run_cell(
     does not exist there.
     """
     run, domain = RunFolder(folder), load_domain(domain_name)
+    config = config.at(domain.spec.discount(cell.variant))
     fingerprint = _fingerprint(config, cell, seed)
     checkpoint = run.policies / f".{cell.name}-{fingerprint[:12]}.checkpoint.safetensors"
     episodes = episodes_evaluated(config, cell)

@@ -216,6 +216,7 @@ class Training:
             mask: the allowed actions; None for all.
             perception: what makes b~, where that is another than influence mode and settings ask for.
         """
+        config = config.at(domain.spec.discount(variant))
         self.config, self.inputs, self.mask = config, inputs, mask
         self.about = {"influence": influence, "variant": variant, "seed": seed, "episodes": config.episodes}
         self.num_actions = len(domain.spec.action_names)
@@ -330,7 +331,7 @@ class Training:
         config, network = self.config, self.network
         age, env, weight = self.replay.draw(config.batch_size, self.rng, config.prioritised)
         states, action, reward, next_states, factor, allowed = self.replay.n_step(
-            age, env, config.n_step, config.discount
+            age, env, config.n_step, config.per_step
         )
         state, at = distinct(states)
         next_state, next_at = distinct(next_states)

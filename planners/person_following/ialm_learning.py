@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from domains.core import FORWARD, STAY
+from domains.core import DISCOUNT, FORWARD, STAY
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
 from planners.models.split_tables import learn_by
@@ -29,7 +29,7 @@ def learn_ialm(
     codec: Codec,
     experience: Experience,
     provenance: dict[str, Any] | None = None,
-    discount: float = 0.9,
+    discount: float = DISCOUNT,
 ) -> IALM:
     """Learn every table from experience.
 

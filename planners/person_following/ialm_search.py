@@ -66,7 +66,7 @@ class IALMSearch:
             config.simulations,
             config.time_left(spent),
             config.depth,
-            config.discount,
+            config.per_step,
             config.exploration,
             False,
             mask,

@@ -208,7 +208,7 @@ class LeafValuePOUCT(pomdp_py.POUCT):
             max_depth=config.depth,
             num_sims=-1 if limited else config.pomdp_py_simulations,
             planning_time=config.time_left(spent) if limited else -1.0,
-            discount_factor=config.discount,
+            discount_factor=config.per_step,
             exploration_const=config.exploration,
             rollout_policy=LocalPolicyModel(model.dbn.action_names),
         )

@@ -46,7 +46,7 @@ class LocalQMDP:
 
     def __init__(self, model: IALM, compiled: Model, config: SearchConfig, rng: np.random.Generator) -> None:
         self.local = LocalModel(compiled, np.ascontiguousarray(model.leaf_values))
-        self.num_actions, self.discount = model.dbn.num_actions, config.discount
+        self.num_actions, self.discount = model.dbn.num_actions, config.per_step
         self._bits = stream(rng)
 
     def plan(

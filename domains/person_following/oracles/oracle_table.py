@@ -24,7 +24,7 @@ Act = Callable[[Batch, dict[str, NDArray[Any]]], NDArray[np.int64]]
 
 def oracle_row(
     variant: str,
-    discount: float = 0.99,
+    discount: float | None = None,
     max_beliefs: int = MAX_BELIEFS,
     num_maps: int | None = None,
     seed: int = 0,
@@ -34,7 +34,7 @@ def oracle_row(
 
     Args:
         variant: name of the variant.
-        discount: of the optima; returns are reported without discount.
+        discount: of the optima, by default that of the variant; returns are reported without discount.
         max_beliefs: where the Bayes search stops, whether or not its bounds have met.
         num_maps: how many maps to draw from all, equally weighted; None for all of them.
         seed: of that draw.
@@ -48,6 +48,7 @@ def oracle_row(
     started = time.monotonic()
     chains = person_chains(grids, parameters)
     shares = np.repeat(weights / parameters.num_goals, parameters.num_goals)
+    discount = DOMAIN.spec.discount(variant) if discount is None else discount
     worlds = Worlds(chains, shares, parameters, discount)
     row: dict[str, Any] = {"variant": variant, "changes": changes, "worlds": len(chains), "discount": discount}
     alone = np.array([(solved.total, solved.success) for solved in worlds.solved])

@@ -8,16 +8,17 @@ from typing import Any
 from nesy.errors import UserError
 from nesy.report import comparison_figures, figures
 from nesy.report.html_pieces import figure, table
-from nesy.report.text import COMPARISON_COLUMNS, comparison_rows, number
+from nesy.report.text import COMPARISON_COLUMNS, comparison_rows, number, shared_note, shown
 from nesy.run_folder import RunFolder, read_json
 
 ANCHOR = "comparison"
 TITLE = "Comparison"
 INTERVALS = (
     "Evaluation on the same maps and seeds for all. Brackets: 95 % bootstrap intervals, stratified by map; where each "
-    "map comes once, of what the optimum there does not explain; where maps are too many to be played, over maps; of "
-    "agents that learn, with three seeds or more, over seeds (with fewer they leave out how much one training differs "
-    "from another). 'learned from' counts environment steps besides those of the world model."
+    "map comes once, of what the optimum there does not explain; where more maps are there than have been played, over "
+    "maps; of agents that learn, with two seeds or more, over seeds (with one they leave out how much one training "
+    "differs from another). [-]: nothing varied, or there is but one episode. 'learned from' counts environment steps "
+    "besides those of the world model."
 )
 
 
@@ -25,10 +26,10 @@ def make(run: RunFolder, summary: dict[str, Any]) -> str:
     """The cells of the comparison as tables and as pictures."""
     cells = summary["comparison"]
     parts = [
-        table(COMPARISON_COLUMNS, comparison_rows(cells), INTERVALS, text_columns=4),
+        table(COMPARISON_COLUMNS, comparison_rows(cells), f"{INTERVALS} {shared_note(cells)}".strip(), text_columns=4),
         figure(
             figures.svg(comparison_figures.returns(cells)),
-            "Return per episode. The optimum is exact: dynamic programming over the full state.",
+            "Return per episode. The optimum's policy is exact: dynamic programming over the full state.",
             "Mean return of every agent with its interval",
         ),
     ]
@@ -55,7 +56,7 @@ def make(run: RunFolder, summary: dict[str, Any]) -> str:
 
 def _metrics(cells: list[dict[str, Any]]) -> str:
     """Every metric of docs/metrics.md, one column per agent and condition."""
-    measured = [cell for cell in cells if cell.get("metrics")]
+    measured = [cell for cell in map(shown, cells) if cell.get("metrics")]
     if not measured:
         return ""
     names = list(dict.fromkeys(name for cell in measured for name in cell["metrics"]))

@@ -23,7 +23,7 @@ def make(run: RunFolder, summary: dict[str, Any]) -> str:
     if not curves:
         return "<p>No agent of this comparison learned.</p>"
     return figure(
-        figures.svg(comparison_figures.learning(curves, comparison_figures.optima(summary["comparison"]))),
+        figures.svg(comparison_figures.learning(curves, comparison_figures.exact_optima(summary["comparison"]))),
         "Return of the training episodes, exploration included. Left the policy as it was, right the average over "
         "everything since the beginning, as the paper plots it. Bands: 95 % over seeds, where there are several.",
         "Learning curves of the DQN",

@@ -13,6 +13,8 @@ TITLE = "How it was made"
 
 def make(run: RunFolder, summary: dict[str, Any]) -> str:
     """Settings, versions, machine and times."""
-    return figures_table(summary["provenance"], "Settings, versions and machine") + figures_table(
-        summary["timing"], "Seconds per step of the pipeline"
+    made = {name: value for name, value in summary["provenance"].items() if name != "steps"}
+    timing = {step: seconds for step, seconds in summary["timing"].items() if step != "report"}  # not known yet
+    return figures_table(made, "Settings, versions and machine") + figures_table(
+        timing, "Seconds per step of the pipeline, this page left out"
     )

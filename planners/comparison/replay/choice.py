@@ -20,7 +20,7 @@ class Chosen:
         reasons: of `REASONS`.
         total: its recorded return.
         outcome: its recorded outcome.
-        regret: against the optimum or the best agent; None where no other agent met the same map.
+        regret: against the optimum; None where the optimum has not played the episode.
     """
 
     episode: int
@@ -71,16 +71,10 @@ def all_reasons(tables: dict[Cell, dict[str, list[Any]]], cell: Cell) -> list[Ch
 
 
 def _regret(tables: dict[Cell, dict[str, list[Any]]], cell: Cell, episode: int) -> float | None:
-    """What the optimum, or else the best other agent, got more on the same episode of the same map."""
+    """What the optimum got more on the same episode of the same map; None where it has not played it."""
     own = tables[cell]
-    others = [
-        (other, table)
-        for other, table in tables.items()
-        if other.variant == cell.variant
-        and other != cell
-        and episode < len(table["return"])
-        and table["map_id"][episode] == own["map_id"][episode]
-    ]
-    optimum = [table for other, table in others if other.agent == "optimum"]
-    best = [float(table["return"][episode]) for table in optimum or [table for _, table in others]]
-    return max(best) - float(own["return"][episode]) if best else None
+    for other, table in tables.items():
+        alike = (other.agent, other.variant, other.seed) == ("optimum", cell.variant, cell.seed)
+        if alike and episode < len(table["return"]) and table["map_id"][episode] == own["map_id"][episode]:
+            return float(table["return"][episode]) - float(own["return"][episode])
+    return None

@@ -1,8 +1,8 @@
 """Replays: a few episodes of the comparison played again, with everything that was seen, believed and weighed.
 
 Which episodes is decided by a rule that looks at results alone: of every agent under every condition (first seed)
-the first success, the first failure, and the episode with the worst regret (the optimum's return on the episode,
-or the best agent's where there is no optimum, minus its own). The episodes start and run as they did in the
+the first success, the first failure, and the episode with the worst regret (the optimum's return on the episode
+minus its own; without the optimum among the agents there is none). The episodes start and run as they did in the
 comparison, so each return must be the recorded one; `reproduced` says whether it is.
 
 results/replays.json   maps, and per episode its steps: state, view, b, b~, decoded views, values, tree, rules
@@ -38,7 +38,7 @@ from planners.search.tree_top import in_words, top_of_flat_tree, top_of_pomdp_py
 FORMAT, VERSION = "nesy-replays", 2
 RULE = (
     "of every agent under every condition, first seed: the first success, the first failure, and the worst regret "
-    "(the optimum's return on the same episode, or the best agent's where there is no optimum, minus its own)"
+    "(the optimum's return on the same episode minus its own)"
 )
 
 
@@ -122,7 +122,7 @@ def _fingerprint(run: RunFolder, cells: Sequence[Cell]) -> str:
     """Changes whenever a cell has been run anew with other settings."""
     marks = [[cell.name, (pq.read_schema(cell_path(run, cell)).metadata or {}).get(b"fingerprint", b"").decode()]
              for cell in cells]  # fmt: skip
-    return hashlib.sha256(json.dumps([VERSION, MOST_EPISODES, marks]).encode()).hexdigest()
+    return hashlib.sha256(json.dumps([VERSION, MOST_EPISODES, RULE, marks]).encode()).hexdigest()
 
 
 def _is_current(path: Path, fingerprint: str) -> bool:

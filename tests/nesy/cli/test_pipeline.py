@@ -113,17 +113,60 @@ def test_the_page_is_self_contained_and_its_table_comes_from_the_summary(run: Pa
     assert "Content-Security-Policy" in page
 
 
-def test_running_again_repeats_nothing(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_running_again_repeats_nothing(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     kept = (
+        "config.json",
+        "summary.json",
+        "report.html",
+        "results/comparison.csv",
+        "results/replays.json",
         "experience/part-00000.parquet",
         "world_model/model.safetensors",
         "dbn/tables.npz",
         "results/episodes.parquet",
     )
     before = {name: (run / name).read_bytes() for name in kept}
+    monkeypatch.setattr("nesy.cli.pipeline._versions", lambda: {"python": "of another day"})
     assert main(["run", "--run", str(run), *TINY]) == 0
     assert {name: (run / name).read_bytes() for name in kept} == before
     assert "optimum" in capsys.readouterr().out
+    for command in ("collect", "train", "extract", "compare", "report"):
+        assert main([command, "--run", str(run)]) == 0
+        assert {name: (run / name).read_bytes() for name in kept} == before, command
+
+
+def test_what_is_done_later_is_recorded_as_of_then(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = json.loads((copy / "summary.json").read_text())
+    monkeypatch.setattr("nesy.cli.pipeline._versions", lambda: {"python": "of another day"})
+    (copy / "report.html").unlink()
+    assert main(["report", "--run", str(copy)]) == 0
+    after = json.loads((copy / "summary.json").read_text())
+    assert after["provenance"]["steps"].pop("report") == {"python": "of another day"}
+    del before["provenance"]["steps"]["report"]
+    assert after["provenance"]["steps"] == before["provenance"]["steps"]
+    assert after["timing"].pop("report") > before["timing"].pop("report")
+    assert after["timing"] == before["timing"] and after["comparison"] == before["comparison"]
+
+
+def test_rows_of_the_table_are_about_the_same_episodes(run: Path) -> None:
+    cells = json.loads((run / "summary.json").read_text())["comparison"]
+    assert {cell["episodes"] for cell in cells} == {2, 42}
+    assert {row[-1] for row in comparison_rows(cells)} == {"2"}
+    rows = pq.read_table(run / "results" / "episodes.parquet").to_pylist()
+    for cell in cells:
+        played = [
+            row["return"]
+            for row in rows
+            if row["phase"] == "eval"
+            and row["episode"] < 2
+            and row["agent"] == cell["agent"]
+            and (row["influence"] or "") == cell["influence"]
+        ]
+        if cell["agent"] != "optimum":
+            assert cell["shared"]["return"]["mean"] == pytest.approx(sum(played) / 2, abs=1e-3)
+    assert "2 episodes of paper that all agents have played" in (run / "report.html").read_text()
 
 
 def test_other_settings_for_a_finished_step_are_refused(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -14,7 +15,7 @@ from nesy.errors import UserError
 from nesy.run_folder import RunFolder, read_json
 from planners.baselines import LastSeenFollower, OracleFollower
 from planners.comparison.compare import compare
-from planners.comparison.evaluation import Player, evaluate
+from planners.comparison.evaluation import Player, evaluate, evaluation_maps
 from planners.comparison.grid import EVALUATION_SEED, grid
 from planners.comparison.replay.why import find_cell
 from planners.comparison.results import _interval
@@ -59,6 +60,39 @@ def test_a_finished_cell_is_not_run_again_and_a_damaged_one_is(tmp_path: Path) -
     assert files[1].stat().st_mtime_ns == untouched
     assert files[0].stat().st_size > 100
     assert _rows(run) == before
+
+
+def test_the_first_episodes_of_more_are_those_of_fewer() -> None:
+    """Agents that play fewer episodes play the first ones of the others, also where maps differ in probability."""
+    domain = load_domain()
+    for variant in ("paper", "occluded"):
+        few, many = (evaluation_maps(domain, variant, count) for count in (5, 60))
+        assert few is not None and many is not None and np.array_equal(many[:5], few)
+    few, many = (evaluate(domain, "intent", Player(OracleFollower()), count, EVALUATION_SEED) for count in (3, 50))
+    assert np.array_equal(few["return"], many["return"][:3]) and np.array_equal(few["map_id"], many["map_id"][:3])
+
+
+def test_maps_are_met_in_proportion_to_their_probability() -> None:
+    weights = np.array([0.5, 0.05, 0.3, 0.15])
+    domain = SimpleNamespace(maps=lambda variant: (np.arange(4), weights))
+    for count in (20, 100, 997):
+        met = np.bincount(evaluation_maps(domain, "any", count), minlength=4)  # type: ignore[arg-type]
+        assert met == pytest.approx(count * weights, abs=2)
+
+
+def test_one_discount_per_variant(tmp_path: Path) -> None:
+    spec = load_domain().spec
+    assert [spec.discount(variant) for variant in ("paper", "clean", "occluded", "intent", "false_belief")] == [
+        *(0.9, 0.9, 0.99, 0.99, 0.99)
+    ]
+    told = CompareConfig(search=SearchConfig(discount=0.5)).at(spec.discount("intent"))
+    assert (told.dqn.per_step, told.search.per_step) == (0.99, 0.5)  # a discount that is given holds
+    env = load_domain()
+    played = evaluate(env, "intent", Player(OracleFollower()), 1, EVALUATION_SEED)
+    short = played["length"][0]
+    assert played["discounted_return"][0] >= played["return"][0] * 0.99**short
+    with pytest.raises(UserError, match=r"discount must be in \[0, 1\)"):
+        SearchConfig(discount=1.0)
 
 
 def test_followers_reach_the_known_figures() -> None:

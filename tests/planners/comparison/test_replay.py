@@ -31,8 +31,10 @@ def test_first_success_first_failure_and_worst_regret_are_chosen() -> None:
     chosen = choose(TABLES)
     picked = {(item.episode, item.reasons): item.regret for item in chosen[cell("random")]}
     assert picked == {(0, ("first failure", "worst regret")): 99.0, (2, ("first success",)): None}  # another map
-    # against the others where it is the optimum itself: nobody does better, so there is nothing to regret
+    # the optimum has nothing to regret, and without it nobody has: no other agent stands in for it
     assert [item.reasons for item in chosen[cell("optimum")]] == [("first success",), ("first failure",)]
+    alone = choose({cell("random"): TABLES[cell("random")], cell("dqn"): TABLES[cell("optimum")]})
+    assert all(item.regret is None for items in alone.values() for item in items)
 
 
 def test_no_more_than_asked_for() -> None:

@@ -64,7 +64,7 @@ class MappedSearch:
             belief.weights.sum(1)[places],
             belief.robot,
             HORIZON,
-            config.mind_discount,
+            config.per_step,
         )
         particles = MappedParticles(
             np.cumsum(belief.weights[people, lost]), node.reshape(-1).astype(np.int64), lost, belief.robot
@@ -76,7 +76,7 @@ class MappedSearch:
             config.simulations,
             config.time_left(spent + time.perf_counter() - begun),
             DEPTH,
-            config.mind_discount,
+            config.per_step,
             config.mind_exploration,
             False,
             mask,

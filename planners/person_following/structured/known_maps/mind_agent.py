@@ -56,7 +56,7 @@ class MindSearch:
             config.simulations,
             config.time_left(spent),
             config.mind_depth,
-            config.mind_discount,
+            self.ways.discount,
             config.mind_exploration,
             False,
             mask,
@@ -89,7 +89,7 @@ class MindAgent(BeliefAgent):
         super().__init__(geometry, seed)
         self.influence, self.config = influence, config
         slack = SLACK if influence == "egocentric" else None
-        self.ways = Ways(model, codec, config.mind_discount, slack)
+        self.ways = Ways(model, codec, config.per_step, slack)
 
     def _told(self, situation: Situation) -> Sequence[Truth | None]:
         if self.influence != "perfect-information":
