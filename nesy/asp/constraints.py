@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nesy.asp.program.facts import asp_name
+from nesy.asp.names import TERM, encode
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
 
 MOST_EXAMPLES = 20
 
-_ATOM = re.compile(r"impossible\((\w+),(\d+),\(([\d,]*)\),(\d+)\)$")
+_ATOM = re.compile(rf"impossible\(({TERM}),(\d+),\(([\d,]*)\),(\d+)\)$")
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def remove_entries(dbn: TwoSliceDBN, atoms: Sequence[str]) -> tuple[TwoSliceDBN,
     Raises:
         UserError: an atom names no entry, or a row would be left empty.
     """
-    actions = [asp_name(name) for name in dbn.action_names]
+    actions = [encode(name) for name in dbn.action_names]
     table = np.array(dbn.probabilities)
     touched = set()
     examples: list[tuple[str, str]] = []

@@ -17,8 +17,8 @@ import clingo
 import numpy as np
 from clingo import ast
 
+from nesy.asp.names import encode
 from nesy.asp.program.encoding import ENCODINGS
-from nesy.asp.program.facts import asp_name
 from nesy.asp.program.solver import solve
 from nesy.asp.program.sources import Programs, Source, read_sources
 from nesy.errors import UserError
@@ -99,7 +99,7 @@ class Shield:
         """
         self.role = role
         self.action_names = tuple(action_names)
-        self._actions = tuple(asp_name(name) for name in action_names)
+        self._actions = tuple(encode(name) for name in action_names)
         if fallback not in ("all", "stay", "error"):
             raise UserError(f"no fallback '{fallback}'; the fallbacks are all, stay, error")
         if fallback == "stay" and stay not in self.action_names:
@@ -110,7 +110,7 @@ class Shield:
         self._size = (num_factors, num_values)
         words = " ".join(source.text for source in self._sources)
         # only what some rule mentions can matter
-        self.predicates = tuple(name for name in predicates if asp_name(name) in words)
+        self.predicates = tuple(name for name in predicates if encode(name) in words)
         self._uses_code = re.search(rf"\b{role.code}\s*\(", words) is not None
         labelled = [_labelled(source, role) for source in self._sources]
         programs = [*self._sources, self._encoding()]
@@ -129,7 +129,7 @@ class Shield:
                 continue
             known = f"nothing makes {atom} true; #defined {name}/{atom.count(',') + 1}. if that is meant"
             if name == self.role.view:
-                close = difflib.get_close_matches(argument.rstrip(")"), [asp_name(p) for p in self._vocabulary], n=1)
+                close = difflib.get_close_matches(argument.rstrip(")"), [encode(p) for p in self._vocabulary], n=1)
                 known = "no such predicate" + (f" (did you mean '{close[0]}'?)" if close else "")
             raise UserError(f"{place}: {atom}: {known}")
         words = " ".join(source.text for source in self._sources)
@@ -195,7 +195,7 @@ class Shield:
         if self.role == ROBOT:
             lines.append("#external unseen.")
             lines.append(f"#external person(X,Y,H) : X = 0..{size - 1}, Y = 0..{size - 1}, H = 0..3.")
-        lines += [f"#external {self.role.view}({asp_name(name)})." for name in self.predicates]
+        lines += [f"#external {self.role.view}({encode(name)})." for name in self.predicates]
         lines += [f"action({name})." for name in self._actions]
         if self._uses_code:
             lines.append(f"#external {self.role.code}(F,V) : F = 0..{num_factors - 1}, V = 0..{num_values - 1}.")
@@ -268,7 +268,7 @@ class Shield:
 
     def _ask(self, code: np.ndarray, truth: np.ndarray, configuration: int) -> Advice:
         view, at = self.role.view, self.role.code
-        true = {clingo.Function(view, [clingo.Function(asp_name(self.predicates[p]))]) for p in np.flatnonzero(truth)}
+        true = {clingo.Function(view, [clingo.parse_term(encode(self.predicates[p]))]) for p in np.flatnonzero(truth)}
         if self._uses_code:
             true |= {clingo.Function(at, [clingo.Number(f), clingo.Number(int(v))]) for f, v in enumerate(code)}
         if configuration == 0:

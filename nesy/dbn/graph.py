@@ -6,26 +6,25 @@ import networkx
 import numpy as np
 
 from nesy.dbn.model import TwoSliceDBN
+from nesy.names import TEXT, sliced
 
 
 def to_networkx(dbn: TwoSliceDBN, action: int | None = None) -> networkx.MultiDiGraph:
     """The graph of one action, or of all.
 
-    Nodes are `X0` (slice t, attributes `factor`, `slice` 0) and `X0'` (slice t+1). Edges have the key and
+    Nodes are `X0` (slice t, attributes `factor`, `slice` 0) and `X0'` (slice t+1; see nesy.names.sliced). Edges have the key and
     attribute `action`, and `strength` in [0, 1] (see `arc_strength`).
     """
     graph = networkx.MultiDiGraph()
-    for where, mark in ((0, ""), (1, "'")):
+    for where in (0, 1):
         for i, name in enumerate(dbn.factor_names):
-            graph.add_node(f"{name}{mark}", factor=i, slice=where)
+            graph.add_node(sliced(name, where), factor=i, slice=where)
     for a in range(dbn.num_actions) if action is None else (action,):
         for i, name in enumerate(dbn.factor_names):
             strengths = arc_strength(dbn, a, i)
             for (where, p), strength in zip(dbn.parents(a, i), strengths, strict=True):
-                source = dbn.factor_names[p] + ("'" if where else "")
-                graph.add_edge(
-                    source, f"{name}'", key=dbn.action_names[a], action=dbn.action_names[a], strength=strength
-                )
+                source, action = sliced(dbn.factor_names[p], where), TEXT.encode(dbn.action_names[a])
+                graph.add_edge(source, sliced(name, 1), key=action, action=action, strength=strength)
     return graph
 
 

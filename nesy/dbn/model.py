@@ -11,6 +11,7 @@ significant digit, parents of slice t come before those of slice t+1.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -145,6 +146,9 @@ class TwoSliceDBN:
         n, k = self.num_factors, self.num_values
         if not n or not self.num_actions or k < 1:
             raise UserError("a 2DBN needs at least one factor, one value and one action")
+        for name in (*self.factor_names, *self.action_names):
+            if not isinstance(name, str) or re.search("[\ud800-\udfff]", name):
+                raise UserError(f"{name!r}: a factor or action has text as its name (without lone surrogates)")
         if len(set(self.factor_names)) != n or len(set(self.action_names)) != self.num_actions:
             raise UserError("the names of factors and of actions must differ from each other")
         if sorted(self.order) != list(range(n)):

@@ -140,5 +140,18 @@ def format_of(path: Path, format: str | None) -> str:
     return format
 
 
+def name_of(format: str, text: str) -> str:
+    """The name that a file of some format writes as `text`: `name_of("rddl", "do_go_x20left")` is "go left".
+
+    Of PRISM's moves, PDDL's steps and the nodes of slice t+1 in jgum and BIF it is the name before what the file adds.
+    In `graphml`, `dot` and the parents of `csv` and `parquet` a stroke marks slice t+1.
+
+    Raises:
+        UserError: no such format.
+    """
+    module = _module(format_of(Path(), format))
+    return str(module.NAMES.decode(text)) if hasattr(module, "NAMES") else text
+
+
 def _module(name: str) -> ModuleType:
     return importlib.import_module(f"nesy.formats.{FORMATS[name].module}")

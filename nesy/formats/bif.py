@@ -7,14 +7,17 @@ from pathlib import Path
 import numpy as np
 
 from nesy.dbn.model import TwoSliceDBN
-from nesy.formats.bayes_nodes import nodes
+from nesy.formats.bayes_nodes import NAMES, nodes
+from nesy.names import remarks
 from nesy.run_folder import atomic_path
 
 
 def write(dbn: TwoSliceDBN, path: Path) -> None:
     """Write `dbn` to the file `path`."""
     every = list(nodes(dbn))
+    named = [(NAMES.encode(name), name) for name in (*dbn.factor_names, *dbn.action_names)]
     with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as stream:
+        stream.writelines(f"{line}\n" for line in remarks(named, "//"))
         stream.write("network dbn { }\n")
         for node in every:
             values = ", ".join(map(str, range(node.size)))

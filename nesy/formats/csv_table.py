@@ -7,8 +7,11 @@ from pathlib import Path
 
 from nesy.dbn.model import TwoSliceDBN
 from nesy.formats.long_table import parts
+from nesy.names import PRINTED, TEXT, Grammar
 from nesy.run_folder import atomic_path
 
+NAMES = Grammar(first=r"(?![\s=])" + PRINTED, others=r"(?![\s=])" + PRINTED, never=r"'(?=\Z)", suffix="'")
+"""Names of the parents."""
 COLUMNS = ("action", "factor", "parents", "value", "probability", "count")
 
 
@@ -18,8 +21,9 @@ def write(dbn: TwoSliceDBN, path: Path) -> None:
         writer = csv.writer(stream)
         writer.writerow(COLUMNS)
         for part in parts(dbn):
-            action, factor = dbn.action_names[part.action], dbn.factor_names[part.factor]
+            action, factor = TEXT.encode(dbn.action_names[part.action]), TEXT.encode(dbn.factor_names[part.factor])
+            names = [NAMES.encode(dbn.factor_names[p]) + "'" * s for s, p in dbn.parents(part.action, part.factor)]
             rows = zip(part.parent_values.tolist(), part.probabilities.tolist(), part.counts.tolist(), strict=True)
             for values, row, count in rows:
-                given = " ".join(f"{p}={v}" for p, v in zip(part.parents, values, strict=True))
+                given = " ".join(f"{name}={v}" for name, v in zip(names, values, strict=True))
                 writer.writerows((action, factor, given, k, repr(p), count) for k, p in enumerate(row))

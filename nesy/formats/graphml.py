@@ -8,7 +8,11 @@ import networkx
 
 from nesy.dbn.graph import to_networkx
 from nesy.dbn.model import TwoSliceDBN
+from nesy.names import SLICED
 from nesy.run_folder import atomic_path
+
+NAMES = SLICED
+"""Nodes."""
 
 
 def write(dbn: TwoSliceDBN, path: Path) -> None:

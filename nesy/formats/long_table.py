@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nesy.dbn.model import TwoSliceDBN
+from nesy.names import sliced
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class Part:
     action: int
     factor: int
     parents: tuple[str, ...]
-    """Names of the parents, with a stroke for those of slice t+1."""
+    """Names of the parents, with a stroke for those of slice t+1 (see nesy.names.sliced)."""
     parent_values: np.ndarray
     """uint8 [rows, parents]."""
     probabilities: np.ndarray
@@ -40,7 +41,7 @@ def parts(dbn: TwoSliceDBN) -> Iterator[Part]:
             yield Part(
                 action=a,
                 factor=i,
-                parents=tuple(dbn.factor_names[p] + ("'" if where else "") for where, p in parents),
+                parents=tuple(sliced(dbn.factor_names[p], where) for where, p in parents),
                 parent_values=(rows[:, None] // powers % k).astype(np.uint8),
                 probabilities=dbn.cpt(a, i),
                 counts=dbn.counts(a, i),

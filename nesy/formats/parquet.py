@@ -21,8 +21,11 @@ from nesy.dbn.model import TwoSliceDBN
 from nesy.dbn.step_tables import StepTable
 from nesy.errors import UserError
 from nesy.formats.long_table import Part, parts
+from nesy.names import SLICED
 from nesy.run_folder import atomic_path, parse_json
 
+NAMES = SLICED
+"""Names in the column `parents`."""
 KEY, SUM = b"nesy-2dbn", b"nesy-2dbn-sha256"
 _DAMAGE = (pa.ArrowException, OSError, ValueError, KeyError, TypeError, RecursionError, IndexError, AttributeError)
 _TEXTS = ("factor_names", "action_names", "num_values", "order", "parents_now", "parents_next", "value_meanings")

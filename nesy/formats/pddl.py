@@ -19,8 +19,18 @@ import numpy as np
 from nesy.dbn.inference.exact import likely_next
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
-from nesy.formats.bayes_nodes import identifier
+from nesy.formats.prism import named
+from nesy.names import Grammar, remarks
 from nesy.run_folder import atomic_path
+
+NAMES = Grammar(
+    first="[a-z]",
+    others="[a-z0-9_]",
+    never=r"\A(?=x[0-9]+\Z).",
+    reserved=frozenset({"arrive"}),
+    suffix=r"(?:-[0-9]+){1,2}",
+)
+"""Names of actions, in a format that knows no case; numbers follow for the code and the outcome."""
 
 LEAST = 0.05
 """Least probability of an outcome that is not the most probable one."""
@@ -107,8 +117,8 @@ def _outcomes(
 
 def action_of(dbn: TwoSliceDBN, name: str) -> int | None:
     """The action that a step of a plan means; None for the step that ends it."""
-    names = [identifier(action).lower() for action in dbn.action_names]
-    head = name.strip("()").lower().split("-")[0]
+    names = [NAMES.encode(action) for action in dbn.action_names]
+    head = name.strip("() \n").lower().split("-")[0]
     return names.index(head) if head in names else None
 
 
@@ -118,7 +128,11 @@ def _atom(factor: int, value: int) -> str:
 
 def _domain(dbn: TwoSliceDBN, codes: np.ndarray, goals: np.ndarray | None, most: int) -> str:
     costs = most > 1
-    lines = ["(define (domain dbn)", f"  (:requirements :strips{' :action-costs' if costs else ''})"]
+    lines = [
+        *remarks(named(dbn, NAMES), ";"),
+        "(define (domain dbn)",
+        f"  (:requirements :strips{' :action-costs' if costs else ''})",
+    ]
     lines.append("  (:predicates (reached)")
     for i in range(dbn.num_factors):
         lines.append("    " + " ".join(_atom(i, k) for k in range(dbn.num_values)))
@@ -134,7 +148,7 @@ def _domain(dbn: TwoSliceDBN, codes: np.ndarray, goals: np.ndarray | None, most:
             changes = [i for i in range(dbn.num_factors) if now[i] != later[i]]
             if not changes or later not in known:
                 continue
-            name = f"{identifier(action).lower()}-{number}" + (f"-{rank}" if rank else "")
+            name = f"{NAMES.encode(action)}-{number}" + (f"-{rank}" if rank else "")
             lines.append(f"  (:action {name} :parameters ()")
             lines.append(f"    :precondition (and {' '.join(_atom(i, v) for i, v in enumerate(now))})")
             effects = " ".join(f"(not {_atom(i, now[i])}) {_atom(i, later[i])}" for i in changes)

@@ -1,8 +1,8 @@
 """PRISM models for Storm and PRISM: one module per factor, synchronised on the action.
 
 A factor that looks at others of slice t+1 must move after them. So a step of an action is a chain of
-synchronised moves `action`, `action_1`, ...: level by level the next values are drawn into `y_i`, and the last
-move, `action_end`, makes them the present ones. Without such arcs a step is one move on the `x_i` themselves.
+synchronised moves `action`, `action__1`, ...: level by level the next values are drawn into `y_i`, and the last
+move, `action__end`, makes them the present ones. Without such arcs a step is one move on the `x_i` themselves.
 
 Reward and termination, where the model has them, become the reward structure "reward" and the flag `done`, after
 which nothing moves; rows of those tables that experience never met pay nothing and end nothing.
@@ -18,8 +18,21 @@ import numpy as np
 from nesy.dbn.inference.plans import Reached, reached
 from nesy.dbn.model import TwoSliceDBN
 from nesy.dbn.step_tables import StepTable
-from nesy.formats.bayes_nodes import identifier
+from nesy.names import Grammar, remarks
 from nesy.run_folder import atomic_path
+
+_WORDS = """A bool clock const ctmc C double dtmc E endinit endinvariant endmodule endobservables endplayer endrewards
+endsystem F false filter floor formula func G global I idtmc imdp init invariant int label log ceil ctmdp ma max mdp min
+mod module nondeterministic observable observables of P player Pmax Pmin pomdp popta pow prob probabilistic pta R rate
+rewards Rmax Rmin round S smg stochastic system tg true U W X"""
+_OWN = "doing done ending phase step"
+"""Variables and modules of the file, besides x0, y0, factor_x0, ..."""
+NAMES = Grammar(
+    never=r"_(?![A-Za-z0-9])|\A(?=(?:[xy]|factor_x)[0-9]+\Z).",
+    reserved=frozenset(f"{_WORDS} {_OWN}".split()),
+    suffix=r"__(?:[0-9]+|end)",
+)
+"""Names of actions; what follows `__` is the move's place in a chain."""
 
 
 def write(
@@ -65,9 +78,9 @@ def model_text(
     layered = any(max(level) > 0 for level in levels) or any(
         ps for table in tables.values() for per_action in table.parents_next for ps in per_action
     )
-    actions = [identifier(name) for name in dbn.action_names]
+    actions = [NAMES.encode(name) for name in dbn.action_names]
     lines = ["mdp" if plan is None else "dtmc", ""]
-    lines += [f"// x{i}: {name}" for i, name in enumerate(dbn.factor_names)]
+    lines += remarks(named(dbn, NAMES), "//")
     moves = _moves(actions, levels, layered)
     lines += _clock(moves, plan, layered, "termination" in tables)
     for i in range(dbn.num_factors):
@@ -86,6 +99,12 @@ def model_text(
     if goal:
         lines += ["", f'label "goal" = {" & ".join(f"x{i}={v}" for i, v in goal.items())};']
     return "\n".join(lines) + "\n"
+
+
+def named(dbn: TwoSliceDBN, grammar: Grammar) -> list[tuple[str, str]]:
+    """What a file calls the factors, x0, x1, ..., and the actions, each with its name."""
+    factors = [(f"x{i}", name) for i, name in enumerate(dbn.factor_names)]
+    return factors + [(grammar.encode(name), name) for name in dbn.action_names]
 
 
 def _step(
@@ -154,7 +173,7 @@ def _moves(actions: list[str], levels: list[list[int]], layered: bool) -> list[l
     if not layered:
         return [[action] for action in actions]
     return [
-        [action, *(f"{action}_{level}" for level in range(1, max(level_of) + 1)), f"{action}_end"]
+        [action, *(f"{action}__{level}" for level in range(1, max(level_of) + 1)), f"{action}__end"]
         for action, level_of in zip(actions, levels, strict=True)
     ]
 

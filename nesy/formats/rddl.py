@@ -15,11 +15,15 @@ from pathlib import Path
 
 import numpy as np
 
+from nesy import names
 from nesy.dbn.model import TwoSliceDBN
 from nesy.dbn.step_tables import StepTable
 from nesy.errors import UserError
-from nesy.formats.bayes_nodes import identifier
+from nesy.formats.prism import named
 from nesy.run_folder import atomic_path
+
+NAMES = names.Grammar(never=r"_(?![A-Za-z0-9])", prefix="do_")
+"""Names of actions: pyRDDLGym takes no name that ends in `_`, and has `__` for grounded names."""
 
 MAX_ENTRIES = 200_000
 LEAST = (1e-6, 1e-4, 1e-3)
@@ -50,14 +54,14 @@ def write(dbn: TwoSliceDBN, path: Path, start: np.ndarray | None = None, horizon
             raise UserError(f"RDDL files hold at most {MAX_ENTRIES} probabilities; use another format, e.g. parquet")
         least = fitting[0]
     code = dbn.initial.argmax(axis=1) if start is None else np.asarray(start)
-    actions = [f"do_{identifier(name)}" for name in dbn.action_names]
+    actions = [NAMES.encode(name) for name in dbn.action_names]
     every = every or bool(told.all())
     remarks = [] if every else ["// Rows never met in experience are uniform here."]
     if least:
         apart = np.where(met < least, met, 0.0).sum(axis=1).max()
         off = f"a row is at most {apart:.2g} from the model's in total variation"
         remarks.append(f"// Entries below {least:g} are left out; {off}.")
-    domain = "\n".join([*remarks, _domain(dbn, actions, least)])
+    domain = "\n".join([*remarks, *names.remarks(named(dbn, NAMES), "//"), _domain(dbn, actions, least)])
     with atomic_path(path) as temporary:
         temporary.write_text(domain, encoding="utf-8")
     with atomic_path(path.with_name(f"{path.stem}_instance{path.suffix}")) as temporary:
@@ -101,8 +105,8 @@ def _domain(dbn: TwoSliceDBN, actions: list[str], least: float) -> str:
 
 def _outcomes(dbn: TwoSliceDBN) -> dict[str, StepTable]:
     """Step tables of the file by the name of their non-fluents."""
-    names = {"pays": "reward", "ends": "termination"}
-    return {name: dbn.step_tables[table] for name, table in names.items() if table in dbn.step_tables}
+    tables = {"pays": "reward", "ends": "termination"}
+    return {name: dbn.step_tables[table] for name, table in tables.items() if table in dbn.step_tables}
 
 
 def _by_action(dbn: TwoSliceDBN, actions: list[str], name: str, form: str, otherwise: str) -> str:

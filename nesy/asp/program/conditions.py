@@ -1,4 +1,7 @@
-"""Conditions on codes as people write them: `X3=5`, `X3!=5`, a predicate, `not` a predicate; a comma means and."""
+"""Conditions on codes as people write them: `X3=5`, `X3!=5`, a predicate, `not` a predicate; a comma means and.
+
+Names with commas or spaces can be written in quotes, as in rules: `"a, b"`.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,14 @@ from typing import Literal as OneOf
 
 import numpy as np
 
+from nesy.asp.names import TERM, decode
 from nesy.dbn.codebook import Codebook
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
 
+_PART = re.compile(r'(?:"(?:\\.|[^"\\])*"|[^,])+')
 _LITERAL = re.compile(
-    r"\s*(?:(?P<factor>\w+)\s*(?P<relation>!?=)\s*(?P<value>\d+)|(?P<not>not\s+)?(?P<name>[a-z]\w*))\s*$"
+    r"(?P<factor>.+?)\s*(?P<relation>!?=)\s*(?P<value>[0-9]+)|(?P<not>not\s+)?(?P<name>.+)", re.DOTALL
 )
 
 
@@ -41,28 +46,38 @@ def parse_literals(dbn: TwoSliceDBN, codebook: Codebook | None, text: str, concl
         UserError: a literal is none, or names an unknown factor, value or predicate.
     """
     literals = []
-    for part in filter(None, (piece.strip() for piece in text.split(","))):
-        match = _LITERAL.match(part)
-        if match is None:
-            raise UserError(f"'{part}' is no condition; conditions are X3=5, X3!=5, a predicate, or not a predicate")
-        if match["factor"] is not None:
-            name, value = match["factor"], int(match["value"])
+    for part in filter(None, (piece.strip() for piece in _PART.findall(text))):
+        match = _LITERAL.fullmatch(part)
+        assert match is not None
+        predicates = () if codebook is None else codebook.predicate_names
+        if match["factor"] is not None and _name(part) not in predicates:
+            name, value = _name(match["factor"]), int(match["value"])
             if name not in dbn.factor_names and not (name.isdecimal() and int(name) < dbn.num_factors):
                 raise UserError(f"'{part}': no factor '{name}'; the factors are {', '.join(dbn.factor_names)}")
             factor = dbn.factor_names.index(name) if name in dbn.factor_names else int(name)
             if value >= dbn.num_values:
                 raise UserError(f"'{part}': the values of a factor are 0 to {dbn.num_values - 1}")
             literals.append(Literal("is" if match["relation"] == "=" else "isnt", factor=factor, value=value))
-        elif match["name"] == "same" and not match["not"]:
+            continue
+        fails = _name(part) not in predicates and bool(match["not"])
+        name = _name(match["name"] if fails else part)
+        if name == "same" and not fails and name not in predicates:
             if not conclusion:
                 raise UserError("'same' says that the code does not change: it belongs into the conclusion")
             literals.append(Literal("same"))
+        elif name not in predicates and not re.fullmatch(r"\w+", name):
+            raise UserError(f"'{part}' is no condition; conditions are X3=5, X3!=5, a predicate, or not a predicate")
         else:
             if codebook is None:
                 raise UserError(f"'{part}': this model has no codebook, so nothing is known about predicates")
-            codebook.predicate(match["name"])
-            literals.append(Literal("fails" if match["not"] else "holds", predicate=match["name"]))
+            codebook.predicate(name)
+            literals.append(Literal("fails" if fails else "holds", predicate=name))
     return literals
+
+
+def _name(text: str) -> str:
+    """A name as people write it, or in quotes as rules do: `"a, b"`."""
+    return decode(text) if re.fullmatch(TERM, text) else text
 
 
 def of_factor(literal: Literal, codes: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
+from nesy.asp.names import encode
 from nesy.dbn.codebook import Codebook
 from nesy.dbn.model import TwoSliceDBN
 
@@ -18,7 +19,7 @@ LEAST = 1e-3
 VOCABULARY: dict[str, str] = {
     "factor(F)": "F is a factor, 0 to N-1",
     "value(V)": "V is a value, 0 to K-1",
-    "action(A)": "A is an action: left, right, forward, stay",
+    "action(A)": "A is an action",
     "scale(W)": "the weight that stands for probability 1",
     "parent(A,F,J,P,S)": "under A the J-th parent (from 1) of F in slice t+1 is factor P of slice t+S (S is 0 or 1)",
     "arity(A,F,N)": "F has N parents under A",
@@ -31,19 +32,13 @@ VOCABULARY: dict[str, str] = {
     "view(I)": "I is a distinct view met in experience",
     "seen(I,C)": "view I was met C times",
     "code(I,F,V)": "in the code of view I, factor F has the value V",
-    "cell(I,X,Y,T)": "cell (X,Y) of view I is T: empty, wall, goal or unseen (viewer at (2,4), facing y = 0)",
+    "cell(I,X,Y,T)": "cell (X,Y) of view I is of the kind T (the viewer looks towards y = 0)",
     "predicate(P)": "P is an observable predicate",
     "holds(I,P)": "P holds in view I",
     "cooccurs(F,V,P,N,M)": "of the M distinct views with F = V, P holds in N",
     "together(F,V,G,U,P,N,M)": "of the M distinct views with F = V and G = U (F < G), P holds in N",
 }
-"""Every predicate that a program may use, with its meaning."""
-
-
-def asp_name(name: str) -> str:
-    """A name as an ASP constant."""
-    cleaned = re.sub(r"\W", "_", name, flags=re.ASCII).strip("_") or "unnamed"
-    return cleaned if cleaned[0].islower() else f"n_{cleaned}" if cleaned[0].isdigit() else cleaned.lower()
+"""Every predicate that a program may use, with its meaning (`Facts.vocabulary` names a model's actions too)."""
 
 
 class Facts:
@@ -58,8 +53,8 @@ class Facts:
             all_rows: write the rows never met in experience too.
         """
         self.dbn, self.codebook, self.all_rows = dbn, codebook, all_rows
-        self.actions = tuple(asp_name(name) for name in dbn.action_names)
-        self.predicates = () if codebook is None else tuple(asp_name(n) for n in codebook.predicate_names)
+        self.actions = tuple(encode(name) for name in dbn.action_names)
+        self.predicates = () if codebook is None else tuple(encode(n) for n in codebook.predicate_names)
         self._writers: dict[str, Callable[[], Iterable[str]]] = {
             "factor": lambda: [f"factor(0..{dbn.num_factors - 1})."],
             "value": lambda: [f"value(0..{dbn.num_values - 1})."],
@@ -87,6 +82,16 @@ class Facts:
     def names(self) -> tuple[str, ...]:
         """Names of all predicates that facts exist for."""
         return tuple(self._writers)
+
+    def vocabulary(self) -> dict[str, str]:
+        """Every predicate that a program may use, with its meaning in this model."""
+        words = dict(VOCABULARY)
+        words["action(A)"] += f": {', '.join(self.actions)}"
+        if self.codebook is not None:
+            kinds, size = map(encode, self.codebook.cell_kinds), self.codebook.views.shape[1:]
+            viewer = f"viewer at ({size[0] // 2},{size[1] - 1}), facing y = 0"
+            words["cell(I,X,Y,T)"] = f"cell (X,Y) of view I is T: {', '.join(kinds)} ({viewer})"
+        return words
 
     def mentioned(self, *programs: str) -> tuple[str, ...]:
         """The predicates among `names` that the programs may use."""
@@ -178,7 +183,7 @@ class Facts:
 
     def _cells(self) -> Iterable[str]:
         book = self._book()
-        kinds = [asp_name(kind) for kind in book.cell_kinds]
+        kinds = [encode(kind) for kind in book.cell_kinds]
         for i, view in enumerate(book.views.tolist()):
             yield " ".join(
                 f"cell({i},{x},{y},{kinds[cell]})." for x, column in enumerate(view) for y, cell in enumerate(column)
@@ -209,9 +214,8 @@ class Facts:
             for g in range(f + 1, self.dbn.num_factors):
                 pair = book.codes[:, f].astype(np.int64) * k + book.codes[:, g]
                 met, index, totals = np.unique(pair, return_inverse=True, return_counts=True)
-                hits = np.stack(
-                    [np.bincount(index.reshape(-1), column, len(met)) for column in truth.T], axis=1
-                ).astype(np.int64)
+                columns = [np.bincount(index.reshape(-1), column, len(met)) for column in truth.T]
+                hits = np.array(columns, dtype=np.int64).reshape(len(names), len(met)).T
                 for c, total, row in zip(met.tolist(), totals.tolist(), hits.tolist(), strict=True):
                     for name, hit in zip(names, row, strict=True):
                         yield f"together({f},{c // k},{g},{c % k},{name},{hit},{total})."

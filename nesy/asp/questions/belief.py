@@ -13,8 +13,8 @@ from typing import Any
 import clingo
 import numpy as np
 
+from nesy.asp.names import encode
 from nesy.asp.program.encoding import ENCODINGS
-from nesy.asp.program.facts import asp_name
 from nesy.asp.questions.planning import PredicateTruth
 from nesy.dbn.rows import unique_rows
 from nesy.errors import UserError
@@ -67,7 +67,7 @@ class BeliefQuestions:
         holds, fails = holds[first], fails[first]
         lines = [f"world(0..{len(first) - 1})."]
         for name in predicates:
-            column, constant = book.predicate_names.index(name), asp_name(name)
+            column, constant = book.predicate_names.index(name), encode(name)
             lines.append(f"asked({constant}).")
             lines += [f"holds({c},{constant})." for c in np.flatnonzero(holds[:, column]).tolist()]
             lines += [f"fails({c},{constant})." for c in np.flatnonzero(fails[:, column]).tolist()]
@@ -78,7 +78,7 @@ class BeliefQuestions:
         known, possible = _consequences(control, "cautious"), _consequences(control, "brave")
         result = {}
         for name in predicates:
-            yes, no = f"true({asp_name(name)})", f"false({asp_name(name)})"
+            yes, no = f"true({encode(name)})", f"false({encode(name)})"
             result[name] = Knowledge(name, yes in known, no in known, yes in possible, no in possible)
         return result
 

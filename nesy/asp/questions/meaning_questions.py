@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 from nesy.asp.finding import Edge, Finding, finding
-from nesy.asp.program.facts import asp_name
+from nesy.asp.names import encode
 from nesy.asp.questions.subject import Subject
 from nesy.asp.semantics.meaning import changes_of, mean_view, meaning_of, values_that_imply
 from nesy.errors import UserError
@@ -61,7 +61,7 @@ class MeaningQuestions(Subject):
             "accuracy": found.accuracy,
             "rules": len(found.rules),
             "conditions": found.length,
-            "asp": asp_value_rules(found, f"at({f},{value})", "now", [asp_name(n) for n in names]),
+            "asp": asp_value_rules(found, f"at({f},{value})", "now", [encode(n) for n in names]),
         }
         support = [(sentence(rule, names, True), name, f"{rule.right} of {rule.applies} views") for rule in found.rules]
         text = readable(found, names, predicates=True).replace(found.target, name)
@@ -138,7 +138,7 @@ class MeaningQuestions(Subject):
             "accuracy": found.accuracy,
             "rules": len(found.rules),
             "conditions": found.length,
-            "asp": asp_rules(found, f"now({asp_name(predicate)})", "at"),
+            "asp": asp_rules(found, f"now({encode(predicate)})", "at"),
         }
         names = self.dbn.factor_names
         support = [(sentence(rule, names), predicate, f"{rule.right} of {rule.applies} views") for rule in found.rules]

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nesy.asp.names import encode
 from nesy.asp.program.conditions import Literal, of_factor, parse_literals
 from nesy.asp.program.encoding import ENCODINGS, run_encoding
-from nesy.asp.program.facts import Facts, asp_name
+from nesy.asp.program.facts import Facts
 from nesy.asp.program.solver import solve
 from nesy.asp.program.sources import Programs, Source, read_sources
 from nesy.dbn.codebook import Codebook
@@ -293,14 +294,16 @@ def _solve(
     lines = [f"horizon({horizon}).", "start(0).", *layers.facts(facts.actions, cheapest=not sources)]
     if sources and truth is not None:
         holds, _ = truth.of(codes)
-        names = [asp_name(name) for name in truth.codebook.predicate_names]
+        names = [encode(name) for name in truth.codebook.predicate_names]
         used = [p for p, name in enumerate(names) if any(name in source.text for source in sources)]
         lines += [f"now({c},{names[p]})." for p in used for c in np.flatnonzero(holds[:, p]).tolist()]
     text = "\n".join(lines)
     if sources:
         encoding = Source("plan.lp", (ENCODINGS / "plan.lp").read_text(encoding="utf-8"))
         answer = solve([*sources, encoding], text, (), time_limit=time_limit, core_guided=True)
-        atoms = [] if not answer.models else [_parse(atom) for atom in answer.models[-1]]
+        atoms = (
+            [] if not answer.models else [_parse(atom) for atom in answer.models[-1] if atom.startswith(("do(", "at("))]
+        )
     else:
         atoms = [
             (atom.name, str(atom.arguments[0]), atom.arguments[1].number) for atom in run_encoding(("plan",), text)

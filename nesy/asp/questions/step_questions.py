@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nesy.asp.finding import Edge, Finding, finding
+from nesy.asp.names import encode
 from nesy.asp.program.facts import LEAST
 from nesy.asp.questions.subject import Subject
 from nesy.asp.semantics.meaning import MOST_LINES
@@ -169,7 +170,7 @@ class StepQuestions(Subject):
         from nesy.asp.questions.reachability import reach
 
         started = time.perf_counter()
-        goals = [goal] if goal else list(self.book.predicate_names)
+        goals = [goal] if goal else [encode(name) for name in self.book.predicate_names]
         found = reach(self.dbn, self.codebook, self._truth_if_known(), np.asarray(start), goals, max_steps)
         lines, support = [], []
         for one in sorted(found.found, key=lambda r: (r.steps is None, r.steps or 0)):

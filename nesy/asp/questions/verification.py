@@ -21,9 +21,10 @@ from dataclasses import dataclass, field
 import clingo
 import numpy as np
 
+from nesy.asp.names import encode
 from nesy.asp.program.conditions import Literal, of_factor, parse_literals
 from nesy.asp.program.encoding import ENCODINGS
-from nesy.asp.program.facts import LEAST, asp_name
+from nesy.asp.program.facts import LEAST
 from nesy.asp.questions.diagrams import diagram, diagram_facts
 from nesy.asp.questions.falsification import TRIES, Step, try_steps
 from nesy.asp.semantics.predicates import predicate_rules
@@ -331,7 +332,7 @@ class _Check:
         for kind, where, atom, literals in (("premise", 0, "at", premise), ("conclusion", 1, "next", conclusion)):
             lines += [f"{kind}({_term(literal)})." for literal in literals]
             for name in dict.fromkeys(literal.predicate for literal in literals):
-                lines.append(asp_rules(self.rules[name], f"means({asp_name(name)},{where})", atom))
+                lines.append(asp_rules(self.rules[name], f"means({encode(name)},{where})", atom))
         return lines
 
     def _count_dropped(self, after: Sequence[Literal]) -> None:
@@ -388,5 +389,5 @@ class _Check:
 
 def _term(literal: Literal) -> str:
     if literal.predicate:
-        return f"{literal.kind}({asp_name(literal.predicate)})"
+        return f"{literal.kind}({encode(literal.predicate)})"
     return f"{literal.kind}({literal.factor},{literal.value})"

@@ -8,8 +8,9 @@ from typing import Any
 import clingo
 import numpy as np
 
+from nesy.asp.names import encode
 from nesy.asp.program.encoding import run_encoding
-from nesy.asp.program.facts import Facts, asp_name
+from nesy.asp.program.facts import Facts
 from nesy.dbn.codebook import Codebook
 from nesy.errors import UserError
 
@@ -88,7 +89,7 @@ def values_that_imply(facts: Facts, book: Codebook, predicate: str, least: float
     """Text and rows: values, alone or two together, with which a predicate holds."""
     dbn = facts.dbn
     truth = book.predicate(predicate)
-    name = asp_name(predicate)
+    name = encode(predicate)
     program = "\n".join([*facts.cooccurs(predicates=(name,)), *facts.together(predicates=(name,))])
     atoms = run_encoding(("implies",), f"asked({name}). least({_percent(least)}). {program}")
     rows = []

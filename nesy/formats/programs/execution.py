@@ -66,7 +66,7 @@ def by_fast_downward(
     for step in steps:
         action = pddl.action_of(dbn, step) if step.startswith("(") else None
         if action is not None:
-            number, rank = (int(part) for part in (step.strip("()").split("-")[1:] + ["0"])[:2])
+            number, rank = (int(part) for part in (step.strip("() ").split("-")[1:] + ["0"])[:2])
             plan.append((action, tuple(likely_next(dbn, codes[number][None], action)[0][0, rank].tolist())))
     return plan
 
