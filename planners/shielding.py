@@ -16,8 +16,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from domains.core import Domain
+from nesy.asp.shield import Advice, Fallback, Shield, usual_fallback
 from nesy.asp.program.sources import Programs
-from nesy.asp.shield import Advice, Fallback, Shield
 from nesy.errors import UserError
 
 _LOG = logging.getLogger(__name__)
@@ -52,7 +52,8 @@ class ShieldMask:
         rules: rule files (`Path`) or texts (`str`), see docs/asp.md.
         codec: decodes codes.
         domain: evaluates predicates on the decoded views and names the actions.
-        fallback: what is allowed where the rules forbid every action: `all`, only `stay`, or an `error`.
+        fallback: what is allowed where the rules forbid every action: `all`, only `stay`, or an `error`; by
+            default `stay` if there is such an action, else `all`.
         limits: of checking the rules, `time_limit` in seconds and `memory_mb`.
 
     Raises:
@@ -60,7 +61,7 @@ class ShieldMask:
     """
 
     def __init__(
-        self, rules: Programs, codec: Decoder, domain: Domain, fallback: Fallback = "stay", **limits: Any
+        self, rules: Programs, codec: Decoder, domain: Domain, fallback: Fallback | None = None, **limits: Any
     ) -> None:
         self.codec, self.predicates = codec, domain.predicates
         self.num_configurations = domain.spec.geometry.num_configurations
@@ -71,7 +72,7 @@ class ShieldMask:
             codec.num_values,
             tuple(domain.predicates.names),
             view_size=domain.spec.geometry.view_size,
-            fallback=fallback,
+            fallback=fallback or usual_fallback(domain.spec.action_names),
             **limits,
         )
         names = list(domain.predicates.names)

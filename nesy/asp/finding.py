@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nesy.errors import UserError
+from nesy.names import TEXT
 from nesy.run_folder import atomic_path, write_json
 
 if TYPE_CHECKING:
@@ -80,7 +81,8 @@ def save_graph(edges: Sequence[Edge], path: Path) -> None:
         import networkx
 
         with atomic_path(path) as temporary:
-            networkx.write_graphml(graph_of(edges), temporary)
+            plain = [(TEXT.encode(a), TEXT.encode(b), label and TEXT.encode(label)) for a, b, label in edges]
+            networkx.write_graphml(graph_of(plain), temporary)
     elif ending == ".dot":
         lines = [f"  {_quoted(a)} -> {_quoted(b)} [label={_quoted(label)}];" for a, b, label in edges]
         with atomic_path(path) as temporary:

@@ -26,6 +26,11 @@ from nesy.errors import UserError
 Fallback = Literal["all", "stay", "error"]
 
 
+def usual_fallback(action_names: Sequence[str]) -> Fallback:
+    """Where rules forbid everything: only `stay` if there is such an action, else all actions."""
+    return "stay" if "stay" in action_names else "all"
+
+
 @dataclass(frozen=True)
 class Role:
     """Whose actions the rules are about, and what the rules call that one's situation."""
@@ -112,11 +117,10 @@ class Shield:
         # only what some rule mentions can matter
         self.predicates = tuple(name for name in predicates if encode(name) in words)
         self._uses_code = re.search(rf"\b{role.code}\s*\(", words) is not None
-        labelled = [_labelled(source, role) for source in self._sources]
         programs = [*self._sources, self._encoding()]
         answer = solve(programs, self._situation_program(), (), time_limit=time_limit, memory_mb=memory_mb)
         self._check_words(answer.notes)
-        self._ground(labelled)
+        self._ground()
         self._check_actions()
 
     def _check_words(self, notes: Sequence[str]) -> None:
@@ -161,10 +165,11 @@ class Shield:
         )
 
     def _encoding(self) -> Source:
-        return Source(self.role.encoding, (ENCODINGS / self.role.encoding).read_text(encoding="utf-8"))
+        return Source(self.role.encoding, (ENCODINGS / self.role.encoding).read_text(encoding="utf-8"), own=True)
 
-    def _ground(self, labelled: Sequence[str]) -> None:
+    def _ground(self) -> None:
         """Ground the rules in this process: they are known to be harmless by now."""
+        labelled = [_labelled(source, self.role) for source in self._sources]
         self._control = clingo.Control(["--warn=none", "--models=1"])
         for text in (*labelled, self._encoding().text, self._situation_program()):
             self._control.add("base", [], text)
@@ -186,7 +191,7 @@ class Shield:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        self._ground([_labelled(source, self.role) for source in self._sources])
+        self._ground()
 
     def _situation_program(self) -> str:
         size = self.view_size
@@ -327,9 +332,10 @@ def _labelled(source: Source, role: Role) -> str:
         if term.ast_type != ast.ASTType.Function or term.name != role.forbidden or len(term.arguments) != 1:
             return
         begin = statement.location.begin
-        place = f"{source.name}:{begin.line}:{begin.column}".replace("\\", "\\\\").replace('"', '\\"')
+        place = f"{source.name}:{begin.line}:{source.column(begin.line, begin.column)}"
+        place = str(clingo.String(place.encode("utf-8", "backslashreplace").decode()))
         body = ", ".join(str(literal) for literal in statement.body)
-        reason = f'because({term.arguments[0]},"{place}")'
+        reason = f"because({term.arguments[0]},{place})"
         lines.append(f"{reason} :- {body}." if body else f"{reason}.")
 
     messages: list[str] = []

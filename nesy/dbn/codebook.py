@@ -37,7 +37,7 @@ class Codebook:
     predicates: np.ndarray
     """bool [V, P]: what holds in each view."""
     predicate_names: tuple[str, ...] = ()
-    """P names, each an ASP constant."""
+    """P names."""
     predicate_meanings: tuple[str, ...] = ()
     """P texts."""
     cell_kinds: tuple[str, ...] = ("empty", "wall", "goal", "unseen")
@@ -58,7 +58,13 @@ class Codebook:
     def build(
         cls, views: np.ndarray, codes: np.ndarray, counts: np.ndarray, vocabulary: PredicateVocabulary | None
     ) -> Codebook:
-        """Make a codebook, with the truth of every predicate of `vocabulary` on every view."""
+        """Make a codebook, with the truth of every predicate of `vocabulary` on every view.
+
+        Raises:
+            UserError: views, codes or counts are no whole numbers in their range.
+        """
+        views, codes = _whole("views", views, np.uint8), _whole("codes", codes, np.uint8)
+        counts = _whole("counts", counts, np.int64)
         names = tuple(vocabulary.names) if vocabulary is not None else ()
         truth = (
             np.asarray(vocabulary.evaluate(views), dtype=bool)
@@ -67,9 +73,9 @@ class Codebook:
         )
         meanings = tuple(vocabulary.meanings.get(name, "") for name in names) if vocabulary is not None else ()
         return cls(
-            views=np.asarray(views, dtype=np.uint8),
-            codes=np.asarray(codes, dtype=np.uint8),
-            counts=np.asarray(counts, dtype=np.int64),
+            views=views,
+            codes=codes,
+            counts=counts,
             predicates=truth,
             predicate_names=names,
             predicate_meanings=meanings,
@@ -137,6 +143,16 @@ class Codebook:
             raise UserError(f"{path}: {error}") from None
         except (KeyError, TypeError, ValueError) as error:
             raise UserError(f"{path}: does not describe a codebook ({error!r})") from None
+
+
+def _whole(what: str, values: np.ndarray, dtype: type[np.integer]) -> np.ndarray:
+    """Values as whole numbers of some type, none of which changes by that."""
+    array, range_ = np.asarray(values), np.iinfo(dtype)
+    with np.errstate(invalid="ignore"):
+        fits = array.dtype.kind in "biuf" and bool(((array >= 0) & (array <= range_.max) & (array % 1 == 0)).all())
+    if not fits:
+        raise UserError(f"{what} of a codebook must be whole numbers from 0 to {range_.max}, found {array.dtype}")
+    return array.astype(dtype)
 
 
 def _typed(array: np.ndarray, dtype: type[np.generic]) -> np.ndarray:

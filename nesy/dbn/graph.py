@@ -12,8 +12,8 @@ from nesy.names import TEXT, sliced
 def to_networkx(dbn: TwoSliceDBN, action: int | None = None) -> networkx.MultiDiGraph:
     """The graph of one action, or of all.
 
-    Nodes are `X0` (slice t, attributes `factor`, `slice` 0) and `X0'` (slice t+1; see nesy.names.sliced). Edges have the key and
-    attribute `action`, and `strength` in [0, 1] (see `arc_strength`).
+    Nodes are `X0` (slice t, attributes `factor`, `slice` 0) and `X0'` (slice t+1), named by nesy.names.sliced. Edges
+    have the key and attribute `action`, and `strength` in [0, 1] (see `arc_strength`).
     """
     graph = networkx.MultiDiGraph()
     for where in (0, 1):
@@ -23,8 +23,8 @@ def to_networkx(dbn: TwoSliceDBN, action: int | None = None) -> networkx.MultiDi
         for i, name in enumerate(dbn.factor_names):
             strengths = arc_strength(dbn, a, i)
             for (where, p), strength in zip(dbn.parents(a, i), strengths, strict=True):
-                source, action = sliced(dbn.factor_names[p], where), TEXT.encode(dbn.action_names[a])
-                graph.add_edge(source, sliced(name, 1), key=action, action=action, strength=strength)
+                source, taken = sliced(dbn.factor_names[p], where), TEXT.encode(dbn.action_names[a])
+                graph.add_edge(source, sliced(name, 1), key=taken, action=taken, strength=strength)
     return graph
 
 

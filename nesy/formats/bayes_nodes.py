@@ -17,7 +17,9 @@ from nesy.names import Grammar
 
 NAMES = Grammar(
     never=r"_(?![A-Za-z0-9])",
-    reserved=frozenset(["default", "discrete", "done", "network", "probability", "property", "table", "type", "variable", "view"]),
+    reserved=frozenset(
+        ["default", "discrete", "done", "network", "probability", "property", "table", "type", "variable", "view"]
+    ),
     suffix="__.*",
 )
 """Names of factors and actions; `done` and `view` are the file's own nodes, the other words are those of BIF."""

@@ -8,8 +8,10 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from nesy.asp.names import encode
+from nesy.asp.program.sources import MAX_NUMBER
 from nesy.dbn.codebook import Codebook
 from nesy.dbn.model import TwoSliceDBN
+from nesy.errors import UserError
 
 SCALE = 1_000_000
 """Probability 1 as an integer weight."""
@@ -69,7 +71,7 @@ class Facts:
             "taken": self._taken,
             "changed": self._changed,
             "view": lambda: [f"view(0..{len(self._book()) - 1})."] if len(self._book()) else [],
-            "seen": lambda: [f"seen({i},{c})." for i, c in enumerate(self._book().counts.tolist())],
+            "seen": lambda: [f"seen({i},{c})." for i, c in enumerate(_numbers(self._book().counts))],
             "code": self._codes,
             "cell": self._cells,
             "predicate": lambda: [f"predicate({p})." for p in self.predicates],
@@ -148,7 +150,7 @@ class Facts:
                 for text, value in zip(texts, table[rows].argmax(axis=1).tolist(), strict=True):
                     yield f"{head}{text},{value})."
             elif kind == "met":
-                for text, count in zip(texts, counts[rows].tolist(), strict=True):
+                for text, count in zip(texts, _numbers(counts[rows]), strict=True):
                     yield f"{head}{text},{count})."
             else:
                 small = np.where(table[rows] < LEAST, table[rows], 0.0).sum(axis=1)
@@ -169,13 +171,13 @@ class Facts:
     def _taken(self) -> Iterable[str]:
         taken = self.dbn.tables.get("taken")
         if taken is not None:
-            yield from (f"taken({a},{c})." for a, c in zip(self.actions, taken.tolist(), strict=True))
+            yield from (f"taken({a},{c})." for a, c in zip(self.actions, _numbers(taken), strict=True))
 
     def _changed(self) -> Iterable[str]:
         changed = self.dbn.tables.get("changed")
         if changed is not None:
-            for action, a, i in self._tables():
-                yield f"changed({action},{i},{int(changed[a, i])})."
+            for (action, _, i), count in zip(self._tables(), _numbers(changed.reshape(-1)), strict=True):
+                yield f"changed({action},{i},{count})."
 
     def _codes(self) -> Iterable[str]:
         for i, code in enumerate(self._book().codes.tolist()):
@@ -225,3 +227,14 @@ class Facts:
         names = self.predicates if predicates is None else tuple(predicates)
         columns = [self.predicates.index(name) for name in names]
         return names, self._book().predicates[:, columns].astype(np.int64)
+
+
+def _numbers(counts: np.ndarray) -> list[int]:
+    """Counts as ASP has them: clingo would make other numbers of those beyond 32 bits.
+
+    Raises:
+        UserError: one is too large.
+    """
+    if counts.size and counts.max() > MAX_NUMBER:
+        raise UserError(f"the count {counts.max()} is too large for ASP facts: numbers are at most {MAX_NUMBER}")
+    return [int(count) for count in counts.tolist()]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -91,22 +92,22 @@ def solve(
             "memory_mb": memory_mb,
             "core_guided": core_guided,
         }
-        lines, killed, status = _run(task, started + time_limit + 0.5)
+        lines, complaints, killed, status = _run(task, started + time_limit + 0.5)
     records = _records(lines)
     problem = next((record for record in records if "error" in record), None)
+    subject = next((source.name for source in reversed(programs) if not source.own), "program")
     if problem is not None:
-        raise UserError(_readable(problem["error"], names))
+        text = _readable(problem["error"], names, programs)
+        raise UserError(text if problem["kind"] == "program" else f"{subject}: {text}")
     found = [record for record in records if "model" in record]
     result = next((record["result"] for record in records if "result" in record), None)
-    if result is None and not any("grounded" in record for record in records):
-        if killed:
-            raise UserError(
-                f"{programs[-1].name if programs else 'program'}: not grounded within {time_limit:g} s; "
-                "its rules have too many instances (bound its variables) or the limit is too short"
-            )
-        raise UserError(f"the solver ended without an answer (status {status}): too little memory or too deep terms")
+    if result is None and killed and not any("grounded" in record for record in records):
+        raise UserError(
+            f"{subject}: not grounded within {time_limit:g} s; "
+            "its rules have too many instances (bound its variables) or the limit is too short"
+        )
     if result is None and not killed:
-        raise UserError(f"the solver ended without an answer (status {status}): {memory_mb} MB may be too little")
+        raise UserError(f"{subject}: {_ended(status, complaints, memory_mb)}")
     if result is None:
         result = {"satisfiable": True if found else None, "exhausted": False, "optimal": False, "messages": []}
     costs = tuple(tuple(int(c) for c in record["cost"]) for record in found)
@@ -122,7 +123,7 @@ def solve(
             "solve": round(result.get("solve_s", 0.0), 4),
             "total": round(time.monotonic() - started, 4),
         },
-        notes=tuple(_readable(message, names) for message in result["messages"]),
+        notes=tuple(_readable(message, names, programs) for message in result["messages"]),
     )
 
 
@@ -137,29 +138,30 @@ def _write_programs(folder: Path, programs: Sequence[Source], facts: str) -> dic
     return names
 
 
-def _run(task: dict[str, Any], deadline: float) -> tuple[str, bool, int]:
-    """Output of the worker, whether it had to be killed, and its exit status."""
+def _run(task: dict[str, Any], deadline: float) -> tuple[str, str, bool, int]:
+    """Output and error output of the worker, whether it had to be killed, and its exit status."""
     process = subprocess.Popen(
         [sys.executable, "-I", str(WORKER)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
+        stderr=subprocess.PIPE,
+        encoding="utf-8",
+        errors="replace",
         start_new_session=True,
     )
     killed = False
     try:
         try:
-            output, _ = process.communicate(json.dumps(task), timeout=max(0.1, deadline - time.monotonic()))
+            output, complaints = process.communicate(json.dumps(task), timeout=max(0.1, deadline - time.monotonic()))
         except subprocess.TimeoutExpired:
             process.kill()
             killed = True
-            output, _ = process.communicate()
+            output, complaints = process.communicate()
     finally:
         with contextlib.suppress(ProcessLookupError):
             process.kill()
         process.wait()
-    return output, killed, process.returncode
+    return output, complaints, killed, process.returncode
 
 
 def _records(lines: str) -> list[dict[str, Any]]:
@@ -171,8 +173,28 @@ def _records(lines: str) -> list[dict[str, Any]]:
     return records
 
 
-def _readable(message: str, names: dict[str, str]) -> str:
-    """A message of the solver's as one line that names the user's files."""
-    for path, name in names.items():
+def _ended(status: int, complaints: str, memory_mb: int) -> str:
+    """Why the worker ended without a result."""
+    if "bad_alloc" in complaints or "MemoryError" in complaints:
+        return f"the program needs more than {memory_mb} MB"
+    if status == -signal.SIGSEGV:
+        return f"the solver crashed: terms become nested too deep, or need more than {memory_mb} MB"
+    if status < 0:
+        return f"the solver was ended by the signal {signal.Signals(-status).name}"
+    last = (complaints.strip().splitlines() or ["no message"])[-1]
+    return f"the solver ended without an answer (status {status}: {last[:200]})"
+
+
+def _readable(message: str, names: dict[str, str], programs: Sequence[Source]) -> str:
+    """A message of the solver's as one line that names the user's files, with columns in characters."""
+    for (path, name), source in zip(names.items(), (*programs, None), strict=True):
+        if source is not None and not source.text.isascii():
+
+            def place(match: re.Match[str], path: str = path, source: Source = source) -> str:
+                line = int(match[1])
+                columns = [str(source.column(line, int(column))) for column in filter(None, match.groups()[1:])]
+                return f"{path}:{line}:{'-'.join(columns)}"
+
+            message = re.sub(rf"{re.escape(path)}:(\d+):(\d+)(?:-(\d+)(?!\d|:))?", place, message)
         message = message.replace(path, name)
     return re.sub(r"\s+", " ", message).strip()

@@ -34,6 +34,8 @@ def main() -> None:
         _solve(task)
     except MemoryError:
         _write({"error": f"the program needs more than {task['memory_mb']} MB", "kind": "memory"})
+    except Exception as error:
+        _write({"error": f"the solver failed ({error})", "kind": "solver"})
 
 
 def _solve(task: dict[str, Any]) -> None:

@@ -299,7 +299,7 @@ def _solve(
         lines += [f"now({c},{names[p]})." for p in used for c in np.flatnonzero(holds[:, p]).tolist()]
     text = "\n".join(lines)
     if sources:
-        encoding = Source("plan.lp", (ENCODINGS / "plan.lp").read_text(encoding="utf-8"))
+        encoding = Source("plan.lp", (ENCODINGS / "plan.lp").read_text(encoding="utf-8"), own=True)
         answer = solve([*sources, encoding], text, (), time_limit=time_limit, core_guided=True)
         atoms = (
             [] if not answer.models else [_parse(atom) for atom in answer.models[-1] if atom.startswith(("do(", "at("))]

@@ -78,8 +78,9 @@ def verify(
     """
     if codes not in ("all", "met"):
         raise UserError(f"codes '{codes}': a property is checked over all codes or over those met")
-    if codes == "met" and (codebook is None or not len(codebook)):
-        raise UserError("this model has no codebook, so it is not known which codes were met")
+    met = _codes_met(dbn, codebook)
+    if codes == "met" and not len(met):
+        raise UserError("this model has no codebook and no table of the codes met, so it is not known which were met")
     before = parse_literals(dbn, codebook, premise)
     after = parse_literals(dbn, codebook, conclusion, conclusion=True)
     if not after:
@@ -90,10 +91,18 @@ def verify(
         if literal.predicate and codebook is not None
     }
     check = _Check(dbn, action, before, rules, least)
-    check.start(codebook, only_met=codes == "met")
+    check.start(met, only_met=codes == "met")
     step = check.counterexample(after)
     first, later = step or ((), ())
     return Verdict(step is None, first, later, check.dropped, least, codes, tuple(rules.values()))
+
+
+def _codes_met(dbn: TwoSliceDBN, codebook: Codebook | None) -> np.ndarray:
+    """The distinct codes met in experience, integers [C, N]: those of the views, or else those that the model keeps."""
+    if codebook is not None and len(codebook):
+        return codebook.distinct_codes()[0]
+    codes = dbn.tables.get("codes", np.zeros((0, dbn.num_factors), np.uint8))
+    return np.unique(codes, axis=0)
 
 
 Variable = tuple[int, int]
@@ -120,13 +129,12 @@ class _Check:
     stays: set[int] = field(default_factory=set)
     """Factors proved to keep their value under the premise."""
 
-    def start(self, codebook: Codebook | None, only_met: bool) -> None:
-        """Find out what the premise leaves possible."""
+    def start(self, met: np.ndarray, only_met: bool) -> None:
+        """Find out what the premise leaves possible; `met` uint8 [C, N] are the codes met in experience."""
         dbn = self.dbn
         can = self._possible_values()
         rng = np.random.default_rng(0)
         drawn = np.stack([rng.choice(np.flatnonzero(row), TRIES) if row.any() else np.zeros(TRIES, int) for row in can])
-        met = np.zeros((0, dbn.num_factors), np.uint8) if codebook is None else codebook.distinct_codes()[0]
         met = met[self._satisfies(met)]
         if only_met:
             self.known, self.samples = met, met

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import string
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,8 +16,8 @@ from nesy.dbn.codebook import Codebook
 from nesy.errors import UserError
 
 MOST_LINES = 8
-SYMBOLS = (".", "#", "G", "~")
-"""Of the cell kinds empty, wall, goal and unseen."""
+SYMBOLS = ".#G~" + string.digits + string.ascii_uppercase.replace("G", "") + string.ascii_lowercase
+"""Of the cell kinds, in their order: empty, wall, goal and unseen, then any others."""
 CLEAR = 0.95
 """Share of the views in which a cell is of one kind for the picture to show it."""
 
@@ -27,11 +28,13 @@ def meaning_of(facts: Facts, book: Codebook, f: int, value: int, least: float) -
     """Text and rows: the predicates that `f = value` means, excludes, and leaves open."""
     dbn = facts.dbn
     program = facts.text(("predicate",)) + "\n".join(facts.cooccurs(factors=(f,)))
-    totals = "".join(
-        f"seen_of({name},{count},{len(book)})."
-        for name, count in zip(facts.predicates, book.predicates.sum(axis=0).tolist(), strict=True)
+    # whole numbers of 64 bits here: products of two counts are too large for clingo
+    chosen = book.codes[:, f] == value
+    lift = np.sign(book.predicates[chosen].sum(axis=0) * len(book) - book.predicates.sum(axis=0) * chosen.sum())
+    compared = "".join(
+        f"{'oftener' if s > 0 else 'rarer'}({p})." for p, s in zip(facts.predicates, lift, strict=True) if s
     )
-    atoms = run_encoding(("meaning",), f"asked({f},{value}). least({_percent(least)}). {totals} {program}")
+    atoms = run_encoding(("meaning",), f"asked({f},{value}). least({_percent(least)}). {compared} {program}")
     rows: list[dict[str, Any]] = [
         {
             "relation": atom.name,
@@ -201,12 +204,15 @@ def mean_view(book: Codebook, factor: int, value: int) -> str:
     """The views with a value, laid over each other, in characters; the viewer stands at the bottom, looking up."""
     views = book.views[book.codes[:, factor] == value]
     kinds = len(book.cell_kinds)
+    unclear = "?" if kinds <= len(SYMBOLS) else f"{'?':{len(str(kinds))}}"
+    symbols = list(SYMBOLS) if kinds <= len(SYMBOLS) else [f"{kind:{len(unclear)}}" for kind in range(kinds)]
     shares = (views[..., None] == np.arange(kinds)).mean(axis=0)
     lines = []
     for y in range(views.shape[2]):
         cells = [
-            SYMBOLS[int(shares[x, y].argmax())] if shares[x, y].max() >= CLEAR else "?" for x in range(views.shape[1])
+            symbols[int(shares[x, y].argmax())] if shares[x, y].max() >= CLEAR else unclear
+            for x in range(views.shape[1])
         ]
         lines.append("    " + " ".join(cells))
-    legend = ", ".join(f"{symbol} {kind}" for symbol, kind in zip(SYMBOLS, book.cell_kinds, strict=False))
+    legend = ", ".join(f"{symbol} {kind}" for symbol, kind in zip(symbols, book.cell_kinds, strict=False))
     return "\n".join([*lines, f"    ({legend}; ? differs between the views)"])

@@ -82,8 +82,8 @@ class Arguments:
     """Numbers of views that are held possible, for --knows."""
     shield: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Which actions --rules allow at --start with --person."""
-    fallback: Literal["all", "stay", "error"] = "stay"
-    """What is allowed where the rules forbid every action."""
+    fallback: Literal["all", "stay", "error"] | None = None
+    """What is allowed where the rules forbid every action; by default `stay` if there is such an action, else `all`."""
     constrain: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """What the impossible/4 of --rules removes from the table."""
     out: Path | None = None

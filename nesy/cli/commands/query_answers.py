@@ -61,13 +61,15 @@ def _knows(knowledge: KnowledgeBase, options: Arguments) -> dict[str, Any]:
 
 
 def _shield(knowledge: KnowledgeBase, options: Arguments) -> dict[str, Any]:
+    from nesy.asp.shield import usual_fallback
+
     if not options.rules:
         raise UserError("--shield needs --rules FILE")
     return knowledge.allowed(
         options.rules,
         _start(knowledge, options.start),
         _configuration(knowledge, options.person),
-        fallback=options.fallback,
+        fallback=options.fallback or usual_fallback(knowledge.dbn.action_names),
         time_limit=options.time_limit,
     ).to_dict()
 
@@ -167,15 +169,16 @@ def _program(knowledge: KnowledgeBase, options: Arguments) -> dict[str, Any]:
 
 
 def _vocabulary(knowledge: KnowledgeBase, options: Arguments) -> dict[str, Any]:
-    from nesy.asp import VOCABULARY
+    from nesy.asp.names import encode
 
-    book = knowledge.codebook
-    predicates = {} if book is None else dict(zip(book.predicate_names, book.predicate_meanings, strict=True))
+    facts, book = knowledge.facts.vocabulary(), knowledge.codebook
+    names = () if book is None else map(encode, book.predicate_names)
+    predicates = {} if book is None else dict(zip(names, book.predicate_meanings, strict=True))
     lines = []
-    for title, words in (("Facts that a program can use:", VOCABULARY), ("Observable predicates P:", predicates)):
+    for title, words in (("Facts that a program can use:", facts), ("Observable predicates P:", predicates)):
         width = max(map(len, words), default=0)
         lines += [title, *(f"  {name:{width}}  {meaning}" for name, meaning in words.items())]
-    return {"facts": dict(VOCABULARY), "predicates": predicates, "text": "\n".join(lines)}
+    return {"facts": facts, "predicates": predicates, "text": "\n".join(lines)}
 
 
 def _start(knowledge: KnowledgeBase, text: str) -> list[int]:
