@@ -195,6 +195,6 @@ def _readable(message: str, names: dict[str, str], programs: Sequence[Source]) -
                 columns = [str(source.column(line, int(column))) for column in filter(None, match.groups()[1:])]
                 return f"{path}:{line}:{'-'.join(columns)}"
 
-            message = re.sub(rf"{re.escape(path)}:(\d+):(\d+)(?:-(\d+)(?!\d|:))?", place, message)
+            message = re.sub(rf"{re.escape(path)}:(\d+):(\d+)(?:-(\d+)(?!\d|:\d))?", place, message)
         message = message.replace(path, name)
     return re.sub(r"\s+", " ", message).strip()

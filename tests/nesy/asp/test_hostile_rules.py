@@ -150,14 +150,6 @@ def test_every_entrance_says_where(base, tmp_path, name):
         assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_influence_rules_say_where(tmp_path):
-    from nesy.asp.shield import PERSON, Shield
-
-    with pytest.raises(UserError, match=r"program:1:30: U\+00A0"):
-        Shield("person_forbidden(forward) :-\n" * 0 + "person_forbidden(forward) :- \u00a0person_now(a).",
-               ("forward",), 2, 2, ("a",), role=PERSON)  # fmt: skip
-
-
 @pytest.mark.parametrize(
     "text", ["\ufeffforbidden(go) :- now(wall_ahead).", "% \u00fc \u201c\u00a0\nforbidden(go). %* \u00fc *%"]
 )

@@ -3,9 +3,14 @@
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from nesy.asp import KnowledgeBase
+from nesy.asp.facts import Facts
+from nesy.asp.meaning import meaning_of
+from nesy.dbn.codebook import Codebook
+from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
 from tests.nesy.dbn.toy import toy
 
@@ -114,3 +119,52 @@ def test_a_run_without_extraction_says_which_step_is_missing(tmp_path):
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(UserError, match="nesy extract"):
         KnowledgeBase.from_run(tmp_path)
+
+
+@pytest.mark.parametrize("kinds", [2, 4, 6, 80])
+def test_pictures_of_any_number_of_kinds(base, kinds):
+    from nesy.asp.meaning import mean_view
+
+    names = tuple(f"kind{number}" for number in range(kinds))
+    views = np.arange(3 * kinds, dtype=np.uint8).reshape(-1, 3, 1) % kinds
+    book = Codebook(
+        views=views,
+        codes=np.arange(len(views), dtype=np.uint8)[:, None] % 3,
+        counts=np.ones(len(views), np.int64),
+        predicates=views[:, 0] > 0,
+        predicate_names=("some",),
+        predicate_meanings=("",),
+        cell_kinds=names,
+    )
+    picture, legend = mean_view(book, 0, 1).rsplit("\n", 1)
+    assert len(picture.split("\n")) == 1 and legend.count("kind") == kinds
+    symbols = [entry.split()[0].strip("(") for entry in legend.split("; ?")[0].split(", ")]
+    assert len(set(symbols)) == kinds
+
+
+def test_meanings_compare_shares_exactly_in_large_codebooks():
+    """Products of counts of more than 46,340 views are beyond 32 bits, in which clingo counts."""
+    n = 60_000
+    codes = (np.arange(n) < n - 10).astype(np.uint8)[:, None]
+    truth = np.arange(n)[:, None] < n - 5
+    book = Codebook(
+        views=np.zeros((n, 1, 1), np.uint8),
+        codes=codes,
+        counts=np.ones(n, np.int64),
+        predicates=np.column_stack([truth, ~truth]),
+        predicate_names=("most", "few"),
+        predicate_meanings=("", ""),
+    )
+    dbn = TwoSliceDBN.from_tables([[np.eye(2)]], [[[0]]])
+    rows = meaning_of(Facts(dbn, book), book, 0, 1, 0.95)[1]
+    assert {row["predicate"]: row["relation"] for row in rows} == {"most": "means", "few": "excludes"}
+
+
+@pytest.mark.parametrize("column", ["views", "codes", "counts"])
+@pytest.mark.parametrize("wrong", [0.5, -1.0, 2.0**70, np.nan])
+def test_codebooks_hold_whole_numbers(column, wrong):
+    columns = {"views": np.zeros((2, 1, 1)), "codes": np.zeros((2, 3)), "counts": np.ones(2)}
+    assert len(Codebook.build(**columns, vocabulary=None)) == 2
+    columns[column].flat[0] = wrong
+    with pytest.raises(UserError, match=f"{column} of a codebook must be whole numbers from 0"):
+        Codebook.build(**columns, vocabulary=None)

@@ -26,6 +26,7 @@ def run(tmp_path_factory):
     configuration.save(configuration.PRESETS["smoke"], folder / "config.json", {})
     (folder / "rules.lp").write_text(RULES)
     (folder / "impossible.lp").write_text("impossible(A,F,X,V) :- row(A,F,X,V,W), W < 20000.\n")
+    (folder / "all.lp").write_text("forbidden(A) :- action(A).\n")
     (folder / "endless.lp").write_text("n(0). n(X+1) :- n(X).\n")
     return folder
 
@@ -119,6 +120,43 @@ def test_mistakes_are_one_clear_line(run, capsys, question, words):
     assert main(["query", "--run", str(run), *question]) == 2
     error = capsys.readouterr().err
     assert words in error and "Traceback" not in error
+
+
+def test_hostile_text_is_one_line_and_a_byte_order_mark_is_read(run, capsys, tmp_path):
+    bad, number, marked = (tmp_path / f"{name}.lp" for name in ("bad", "number", "marked"))
+    bad.write_text("forbidden(forward) :- now(wall_ahead),\u00a0unseen.", encoding="utf-8")
+    number.write_text("a. \nforbidden(2147483648).", encoding="utf-8")
+    marked.write_bytes(b"\xef\xbb\xbfq(1).\n#show q/1.\n")
+    for path, place in ((bad, "1:39: U+00A0"), (number, "2:11: 2147483648 is too large")):
+        for question in (["--program", str(path)], ["--program", str(marked), "--rules", str(path)]):
+            assert main(["query", "--run", str(run), *question]) == 2
+            error = capsys.readouterr().err
+            assert f"{path}:{place}" in error and error.count("\n") == 1
+        for question in ("--shield", "--constrain", "--plan=wall_ahead"):
+            assert main(["query", "--run", str(run), question, "--rules", str(path)]) == 2
+            error = capsys.readouterr().err
+            assert f"{path}:{place}" in error and error.count("\n") == 1
+    assert ask(run, capsys, "--program", str(marked))["models"] == [["q(1)"]]
+
+
+def test_models_without_an_action_stay(run, capsys, tmp_path):
+    from dataclasses import replace
+
+    base = real_model()
+    replace(base.dbn, action_names=("Left", "Right", "go on", "Wait")).save(tmp_path / "dbn")
+    base.codebook.save(tmp_path / "dbn")
+    configuration.save(configuration.PRESETS["smoke"], tmp_path / "config.json", {})
+    rules = tmp_path / "rules.lp"
+    rules.write_text('forbidden(A) :- action(A). preferred("go on").')
+    asked = ["--shield", "--rules", str(rules), "--start", "0"]
+    found = ask(tmp_path, capsys, *asked)
+    assert found["rows"][0]["allowed"] == ["Left", "Right", "go on", "Wait"] and "fallback 'all'" in found["text"]
+    assert "fallback 'stay'" in ask(run, capsys, *asked[:1], "--rules", str(run / "all.lp"), "--start", "0")["text"]
+    assert main(["query", "--run", str(tmp_path), *asked, "--fallback", "stay"]) == 2
+    assert "needs an action 'stay'" in capsys.readouterr().err
+    facts = ask(tmp_path, capsys, "--vocabulary")["facts"]
+    assert facts["action(A)"] == 'A is an action: "Left", "Right", "go on", "Wait"'
+    assert "empty, wall, goal, unseen (viewer at (2,4)" in facts["cell(I,X,Y,T)"]
 
 
 def test_ctrl_c_ends_a_query_and_its_process(run):

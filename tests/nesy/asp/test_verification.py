@@ -148,3 +148,14 @@ def test_wrong_conditions_are_explained(text):
         verify(dbn, None, 0, text, "X0=1")
     with pytest.raises(UserError, match="conclusion"):
         verify(dbn, None, 0, "X0=1", "")
+
+
+def test_codes_met_are_known_without_a_codebook_too():
+    dbn, codebook = toy()
+    assert "codes" in dbn.tables
+    for premise, conclusion in (("front=1", "same"), ("front=0", "same"), ("", "goal!=2")):
+        plain = [verify(dbn, book, 1, premise, conclusion, codes="met") for book in (None, codebook)]
+        assert plain[0].holds == plain[1].holds and plain[0].code == plain[1].code
+    without = TwoSliceDBN.from_tables([[np.eye(2)]], [[[0]]])
+    with pytest.raises(UserError, match="no table of the codes met"):
+        verify(without, None, 0, "", "same", codes="met")

@@ -99,6 +99,10 @@ def test_rules_that_exclude_every_move_are_not_followed_there_and_counted() -> N
 
 
 def test_mistakes_are_named() -> None:
+    with pytest.raises(UserError, match=r"program:1:29: U\+00A0 NO-BREAK SPACE"):
+        constrained("person_forbidden(forward) :-\u00a0person_now(wall_ahead).")
+    with pytest.raises(UserError, match="program:1:18: 2147483648 is too large"):
+        constrained("person_forbidden(2147483648) :- person_now(wall_ahead).")
     with pytest.raises(UserError, match="its moves are left, right, forward"):
         constrained("person_forbidden(stay) :- person_now(wall_ahead).")
     with pytest.raises(UserError, match="syntax error"):
