@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from nesy.asp import names
 from nesy.asp.program.facts import SCALE, Facts
 from nesy.dbn.model import TwoSliceDBN
 from nesy.names import remarks
 from nesy.run_folder import atomic_path
 
+NAMES = names
+"""Names of actions, as terms."""
 GROUPS = ("factor", "value", "action", "scale", "parent", "arity", "row", "likely", "met", "dropped")
 
 

@@ -16,9 +16,11 @@ import numpy as np
 from nesy.dbn.model import TwoSliceDBN
 from nesy.dbn.step_tables import StepTable
 from nesy.errors import UserError
+from nesy.formats import bayes_nodes
 from nesy.formats.bayes_nodes import node_names, nodes
 from nesy.run_folder import atomic_path, parse_json, read_json
 
+NAMES = bayes_nodes.NAMES
 PROPERTY = "nesy-2dbn"
 SEAL, END = ', "sha256": "', '"}}\n'
 MOST_VALUES = 10_000

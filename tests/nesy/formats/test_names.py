@@ -146,7 +146,7 @@ def test_a_cell_that_is_called_like_a_factor():
     assert nodes == ["cell_0_0", "n_x76iew", "cell_0_0__go", "n_x76iew__go", "view__cell_0_0", "cell_0_1", "done__go"]
 
 
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(actions=SEVERAL, factors=SEVERAL)
 def test_tables_and_graphs_hold_the_names(actions, factors, tmp_path_factory):
     import networkx
@@ -325,7 +325,7 @@ class TestOtherPrograms:
     def test_the_pddl_reader_finds_every_action(self, tmp_path):
         reader = pytest.importorskip("unified_planning.io")
         dbn = model(NASTY, ("Row", "row"), later=False)
-        formats.export(dbn, tmp_path / "m.pddl", goal={0: 1}, outcomes=2)
+        formats.export(dbn, tmp_path / "m.pddl", goal={0: 1})
         problem = reader.PDDLReader().parse_problem(str(tmp_path / "m.pddl"), str(tmp_path / "m_problem.pddl"))
         found = [action.name for action in problem.actions]
         assert len({name.lower() for name in found}) == len(found)
