@@ -16,8 +16,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from domains.core import Domain
-from nesy.asp.shield import Advice, Fallback, Shield, usual_fallback
 from nesy.asp.program.sources import Programs
+from nesy.asp.shield import Advice, Fallback, Shield, usual_fallback
 from nesy.errors import UserError
 
 _LOG = logging.getLogger(__name__)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nesy.asp.names import TERM, encode
+from nesy.asp.program.names import TERM, encode
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
 

@@ -17,8 +17,8 @@ import clingo
 import numpy as np
 from clingo import ast
 
-from nesy.asp.names import encode
 from nesy.asp.program.encoding import ENCODINGS
+from nesy.asp.program.names import encode
 from nesy.asp.program.solver import solve
 from nesy.asp.program.sources import Programs, Source, read_sources
 from nesy.errors import UserError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from nesy.asp import names
+from nesy.asp.program import names
 from nesy.asp.program.facts import SCALE, Facts
 from nesy.dbn.model import TwoSliceDBN
 from nesy.names import remarks

@@ -11,7 +11,7 @@ from typing import Literal as OneOf
 
 import numpy as np
 
-from nesy.asp.names import TERM, decode
+from nesy.asp.program.names import TERM, decode
 from nesy.dbn.codebook import Codebook
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError

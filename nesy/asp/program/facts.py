@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from nesy.asp.names import encode
+from nesy.asp.program.names import encode
 from nesy.asp.program.sources import MAX_NUMBER
 from nesy.dbn.codebook import Codebook
 from nesy.dbn.model import TwoSliceDBN

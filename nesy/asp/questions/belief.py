@@ -13,8 +13,8 @@ from typing import Any
 import clingo
 import numpy as np
 
-from nesy.asp.names import encode
 from nesy.asp.program.encoding import ENCODINGS
+from nesy.asp.program.names import encode
 from nesy.asp.questions.planning import PredicateTruth
 from nesy.dbn.rows import unique_rows
 from nesy.errors import UserError

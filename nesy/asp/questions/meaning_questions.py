@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 from nesy.asp.finding import Edge, Finding, finding
-from nesy.asp.names import encode
+from nesy.asp.program.names import encode
 from nesy.asp.questions.subject import Subject
 from nesy.asp.semantics.meaning import changes_of, mean_view, meaning_of, values_that_imply
 from nesy.errors import UserError

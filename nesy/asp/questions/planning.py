@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nesy.asp.names import encode
 from nesy.asp.program.conditions import Literal, of_factor, parse_literals
 from nesy.asp.program.encoding import ENCODINGS, run_encoding
 from nesy.asp.program.facts import Facts
+from nesy.asp.program.names import encode
 from nesy.asp.program.solver import solve
 from nesy.asp.program.sources import Programs, Source, read_sources
 from nesy.dbn.codebook import Codebook

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nesy.asp.finding import Edge, Finding, finding
-from nesy.asp.names import encode
 from nesy.asp.program.facts import LEAST
+from nesy.asp.program.names import encode
 from nesy.asp.questions.subject import Subject
 from nesy.asp.semantics.meaning import MOST_LINES
 

@@ -21,10 +21,10 @@ from dataclasses import dataclass, field
 import clingo
 import numpy as np
 
-from nesy.asp.names import encode
 from nesy.asp.program.conditions import Literal, of_factor, parse_literals
 from nesy.asp.program.encoding import ENCODINGS
 from nesy.asp.program.facts import LEAST
+from nesy.asp.program.names import encode
 from nesy.asp.questions.diagrams import diagram, diagram_facts
 from nesy.asp.questions.falsification import TRIES, Step, try_steps
 from nesy.asp.semantics.predicates import predicate_rules

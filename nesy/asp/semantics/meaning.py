@@ -9,9 +9,9 @@ from typing import Any
 import clingo
 import numpy as np
 
-from nesy.asp.names import encode
 from nesy.asp.program.encoding import run_encoding
 from nesy.asp.program.facts import Facts
+from nesy.asp.program.names import encode
 from nesy.dbn.codebook import Codebook
 from nesy.errors import UserError
 

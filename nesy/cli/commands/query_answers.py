@@ -169,7 +169,7 @@ def _program(knowledge: KnowledgeBase, options: Arguments) -> dict[str, Any]:
 
 
 def _vocabulary(knowledge: KnowledgeBase, options: Arguments) -> dict[str, Any]:
-    from nesy.asp.names import encode
+    from nesy.asp.program.names import encode
 
     facts, book = knowledge.facts.vocabulary(), knowledge.codebook
     names = () if book is None else map(encode, book.predicate_names)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from nesy.asp import KnowledgeBase
-from nesy.asp.facts import Facts
-from nesy.asp.meaning import meaning_of
+from nesy.asp.program.facts import Facts
+from nesy.asp.semantics.meaning import meaning_of
 from nesy.dbn.codebook import Codebook
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
@@ -123,7 +123,7 @@ def test_a_run_without_extraction_says_which_step_is_missing(tmp_path):
 
 @pytest.mark.parametrize("kinds", [2, 4, 6, 80])
 def test_pictures_of_any_number_of_kinds(base, kinds):
-    from nesy.asp.meaning import mean_view
+    from nesy.asp.semantics.meaning import mean_view
 
     names = tuple(f"kind{number}" for number in range(kinds))
     views = np.arange(3 * kinds, dtype=np.uint8).reshape(-1, 3, 1) % kinds

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from nesy import formats
 from nesy.asp import KnowledgeBase
-from nesy.asp import names as asp_names
+from nesy.asp.program import names as asp_names
 from nesy.dbn.codebook import Codebook
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
