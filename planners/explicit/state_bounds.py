@@ -123,7 +123,7 @@ def bracket(
             break
         after, policy = applied
         change = after - x
-        scale = float(max(np.abs(x).max(), np.abs(after).max(), np.abs(process.gains).max()))
+        scale = float(max(np.abs(x).max(), share * np.abs(change).max(), np.abs(process.gains).max()))
         slack = rounding(process, scale)
         np.minimum(high, np.where(ends, 0.0, after + share * change.max() + slack), out=high)
         np.maximum(low, np.where(ends, 0.0, after + share * change.min() - slack), out=low)
