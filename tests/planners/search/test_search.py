@@ -111,7 +111,9 @@ def test_what_comes_before_the_search_counts_as_time_spent() -> None:
 
     class Slow(PlanningAgent):
         def _belief(self, rng: np.random.Generator) -> Any:
-            return SimpleNamespace(reset=lambda *_: time.sleep(0.02), states=None, effective=0.0, resets=0)
+            return SimpleNamespace(
+                reset=lambda *_: time.sleep(0.02), states=None, effective=0.0, resets=0, influence=lambda: np.zeros(3)
+            )
 
         def _planner(self, rng: np.random.Generator) -> Any:
             return SimpleNamespace(plan=lambda belief, allowed, spent: (given.append(spent) or 0, {}))
