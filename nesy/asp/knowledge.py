@@ -153,7 +153,7 @@ class KnowledgeBase(MeaningQuestions, StepQuestions):
 
     def _advice(self, shield: Shield, code: np.ndarray, configuration: int) -> Advice:
         truth = self._truth()
-        if not truth.knows(self.dbn._codes(code)[None].astype(np.uint8))[0]:
+        if not truth.knows(self.dbn._codes(code)[None])[0]:
             raise UserError(f"code {tuple(int(v) for v in code)}: no view met has it, so its predicates are not known")
         holds, _ = truth.of(code[None])
         columns = [self.book.predicate_names.index(name) for name in shield.predicates]

@@ -217,7 +217,7 @@ class Shield:
         Raises:
             UserError: the rules forbid every action and the fallback is `error`.
         """
-        key = (bytes(np.asarray(code, dtype=np.uint8)) if self._uses_code else b"", bytes(truth), int(configuration))
+        key = (bytes(np.asarray(code, dtype=np.int64)) if self._uses_code else b"", bytes(truth), int(configuration))
         if key not in self._memory:
             self._memory[key] = self._ask(code, truth, int(configuration))
         return self._memory[key]

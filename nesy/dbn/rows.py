@@ -4,22 +4,34 @@ from __future__ import annotations
 
 import numpy as np
 
+from nesy.checked_arrays import integers
+
 _FEW = 5_000
 """Fewer rows than this are sorted as they are."""
 _BLOCK = 1 << 15
+
+
+def code_type(num_values: int) -> np.dtype:
+    """The narrowest type that holds every value of a factor: uint8 up to K = 256."""
+    return np.min_scalar_type(max(0, num_values - 1))
 
 
 def unique_rows(table: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Distinct rows in lexicographic order.
 
     Args:
-        table: uint8 [n, M].
+        table: whole numbers >= 0 [n, M].
 
     Returns:
         `first` int64 [D]: an index of each distinct row, `index` int64 [n]: which distinct row each row is,
         `counts` int64 [D].
+
+    Raises:
+        UserError: other numbers.
     """
-    table = np.asarray(table, dtype=np.uint8)
+    table = np.asarray(table)
+    if table.dtype != np.uint8:
+        table = integers(table, "rows", (None, None)).astype(np.int64, copy=False)
     n, width = table.shape
     if width == 0:
         return np.zeros(min(n, 1), np.int64), np.zeros(n, np.int64), np.full(min(n, 1), n)
@@ -59,6 +71,10 @@ def _counted(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _sorted(table: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    if table.max(initial=0) > 255:
+        # bytes of big-endian numbers sort as the numbers do
+        kind = np.min_scalar_type(int(table.max())).newbyteorder(">")
+        table = np.ascontiguousarray(table, dtype=kind).view(np.uint8).reshape(len(table), -1)
     padded = np.zeros((len(table), -(-table.shape[1] // 8) * 8), dtype=np.uint8)
     padded[:, : table.shape[1]] = table
     # eight columns are one big-endian number, so numbers sort as the rows do

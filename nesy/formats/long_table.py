@@ -23,7 +23,7 @@ class Part:
     parents: tuple[str, ...]
     """Names of the parents, with a stroke for those of slice t+1 (see nesy.names.sliced)."""
     parent_values: np.ndarray
-    """uint8 [rows, parents]."""
+    """[rows, parents], of the codes' type."""
     probabilities: np.ndarray
     """float64 [rows, K]."""
     counts: np.ndarray
@@ -42,7 +42,7 @@ def parts(dbn: TwoSliceDBN) -> Iterator[Part]:
                 action=a,
                 factor=i,
                 parents=tuple(sliced(dbn.factor_names[p], where) for where, p in parents),
-                parent_values=(rows[:, None] // powers % k).astype(np.uint8),
+                parent_values=(rows[:, None] // powers % k).astype(dbn.code_type),
                 probabilities=dbn.cpt(a, i),
                 counts=dbn.counts(a, i),
             )

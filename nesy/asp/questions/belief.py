@@ -54,7 +54,7 @@ class BeliefQuestions:
         Raises:
             UserError: no particles, or no such predicate.
         """
-        particles = np.asarray(particles, dtype=np.uint8)
+        particles = np.asarray(particles)
         if particles.ndim != 2 or not len(particles):
             raise UserError("a question about a belief needs at least one particle")
         book = self.truth.codebook

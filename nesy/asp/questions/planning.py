@@ -70,7 +70,7 @@ class PredicateTruth:
 
     def _places(self, codes: np.ndarray) -> np.ndarray:
         """Index of each code among `self.codes`, -1 where it is none of them."""
-        both = np.concatenate([self.codes, np.asarray(codes, dtype=np.uint8)])
+        both = np.concatenate([self.codes, np.asarray(codes)])
         _, index, _ = unique_rows(both)
         place = np.full(int(index.max(initial=-1)) + 1, -1)
         place[index[: len(self.codes)]] = np.arange(len(self.codes))
@@ -192,7 +192,7 @@ def reachable(
     Returns:
         uint8 [C, N] (the start first), the moves, and the number of steps to each code.
     """
-    codes = dbn._codes(start)[None].astype(np.uint8)
+    codes = dbn._codes(start)[None].astype(dbn.code_type)
     number = {bytes(codes[0]): 0}
     distance, moves = [0], []
     edge = [0]

@@ -140,7 +140,7 @@ class _Check:
             self.known, self.samples = met, met
             can &= np.stack([np.bincount(column, minlength=dbn.num_values) > 0 for column in met.T])
         else:
-            drawn = drawn.T.astype(np.uint8)
+            drawn = drawn.T.astype(dbn.code_type)
             self.samples = np.concatenate([met, drawn[self._satisfies(drawn)]])
         self.values = {(0, f): np.flatnonzero(can[f]) for f in range(dbn.num_factors)}
 

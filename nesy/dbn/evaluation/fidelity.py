@@ -118,7 +118,7 @@ def network_nll(
 def _chances(network: Conditionals | Marginals, action: int, now: np.ndarray, later: np.ndarray) -> list[np.ndarray]:
     """P(x'_i | ...) of every factor for some steps: N arrays [n, K]."""
     if not isinstance(network, Conditionals):
-        marginals = network(now.astype(np.uint8), action)
+        marginals = network(now, action)
         return [marginals[:, i] for i in range(marginals.shape[1])]
     structure = network.structure()
     result = []
@@ -156,7 +156,7 @@ def _places(rows: np.ndarray, known: np.ndarray) -> np.ndarray:
     """The index of each row among distinct known ones: int64 [n]; -1 where it is none of them."""
     from nesy.dbn.rows import unique_rows
 
-    _, index, _ = unique_rows(np.concatenate([known, rows]).astype(np.uint8))
+    _, index, _ = unique_rows(np.concatenate([known, rows]))
     place = np.full(int(index.max()) + 1, -1, dtype=np.int64)
     place[index[: len(known)]] = np.arange(len(known))
     return np.asarray(place[index[len(known) :]])

@@ -88,7 +88,7 @@ def nll(
     Returns:
         `nll`, `nll_limit` (nats) and `impossible` (share of transitions with probability below 1e-12).
     """
-    kinds = np.column_stack([codes, actions, next_codes]).astype(np.uint8)
+    kinds = np.column_stack([codes, actions, next_codes])
     n = dbn.num_factors
     logs = dbn.log_prob(kinds[:, :n], kinds[:, n], kinds[:, n + 1 :])
     weights = counts / counts.sum()

@@ -57,7 +57,7 @@ def random_transitions(
     dbn: TwoSliceDBN, rng: np.random.Generator, number: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Transitions from uniformly drawn codes under uniformly drawn actions: uint8 [n, N], int64 [n], uint8 [n, N]."""
-    codes = rng.integers(0, dbn.num_values, size=(number, dbn.num_factors)).astype(np.uint8)
+    codes = rng.integers(0, dbn.num_values, size=(number, dbn.num_factors)).astype(dbn.code_type)
     actions = rng.integers(0, dbn.num_actions, size=number)
     return codes, actions, dbn.sample(codes, actions, rng)
 

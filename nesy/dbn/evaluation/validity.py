@@ -11,7 +11,7 @@ from domains.core import MOST_MAPS, Domain, DomainError
 from nesy.dbn.inference.exact import likely_next
 from nesy.dbn.inference.kernels import packed, sample_codes
 from nesy.dbn.model import TwoSliceDBN
-from nesy.dbn.rows import unique_rows
+from nesy.dbn.rows import code_type, unique_rows
 
 TASK = "crossing"
 """The task without anybody else: there the next view depends on nothing but the map and the pose."""
@@ -180,13 +180,14 @@ def impossible_steps(
     codes, next_codes = encode(views), encode(next_views)
     known = np.concatenate([codes, next_codes])
     known = _distinct(known)
-    steps = _distinct(np.column_stack([codes, actions, next_codes]).astype(np.uint8))
+    kind = code_type(max(dbn.num_values, dbn.num_actions))
+    steps = _distinct(np.column_stack([codes, actions, next_codes]).astype(kind))
     rng = np.random.default_rng(seed)
     drawn = known[rng.integers(len(known), size=samples)]
     taken = rng.integers(dbn.num_actions, size=samples)
     later = sample_codes(packed(dbn), drawn, taken, rng.random(drawn.shape))
     contexts = _distinct(steps[:, : dbn.num_factors + 1])
-    best = np.empty((len(contexts), dbn.num_factors), dtype=np.uint8)
+    best = np.empty((len(contexts), dbn.num_factors), dtype=dbn.code_type)
     for a in range(dbn.num_actions):
         here = contexts[:, -1] == a
         best[here] = likely_next(dbn, contexts[here, :-1], a)[0][:, 0]
@@ -204,7 +205,7 @@ def _distinct(rows: np.ndarray) -> np.ndarray:
 
 def _among(rows: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Whether each row is one of the known ones: bool [n]."""
-    _, index, _ = unique_rows(np.concatenate([known, rows]).astype(np.uint8))
+    _, index, _ = unique_rows(np.concatenate([known, rows]))
     there = np.zeros(int(index.max()) + 1, dtype=bool)
     there[index[: len(known)]] = True
     return np.asarray(there[index[len(known) :]])

@@ -169,7 +169,7 @@ def joint_next(dbn: TwoSliceDBN, code: np.ndarray, action: int, drop: float = 0.
         later[:, i] = values
         weights = branches[kept, values]
     best_first = np.argsort(-weights, kind="stable")
-    return later[best_first].astype(np.uint8), weights[best_first]
+    return later[best_first].astype(dbn.code_type), weights[best_first]
 
 
 def likely_next(dbn: TwoSliceDBN, codes: np.ndarray, action: int, beam: int = 16) -> tuple[np.ndarray, np.ndarray]:
@@ -201,7 +201,7 @@ def likely_next(dbn: TwoSliceDBN, codes: np.ndarray, action: int, beam: int = 16
         later = later[row_number, best // dbn.num_values]
         later[:, :, i] = best % dbn.num_values
         weights = branches[row_number, best]
-    return later.astype(np.uint8), weights
+    return later.astype(dbn.code_type), weights
 
 
 def most_probable_next(

@@ -11,6 +11,7 @@ import numpy as np
 
 from nesy.compiled import njit
 from nesy.dbn.model import TwoSliceDBN
+from nesy.dbn.rows import code_type
 from nesy.errors import UserError
 
 
@@ -102,7 +103,7 @@ def _sample_codes(
     actions: np.ndarray,
     uniforms: np.ndarray,
 ) -> np.ndarray:
-    result = np.empty(codes.shape, dtype=np.uint8)
+    result = np.empty(codes.shape, dtype=codes.dtype)
     for b in range(codes.shape[0]):
         sample_into(
             cumulative,
@@ -124,12 +125,12 @@ def sample_codes(tables: Packed, codes: np.ndarray, actions: np.ndarray, uniform
 
     Args:
         tables: the packed model.
-        codes: uint8 [B, N].
+        codes: integers [B, N], as `TwoSliceDBN.code_type`.
         actions: integers [B].
         uniforms: float64 [B, N] in [0, 1).
 
     Returns:
-        uint8 [B, N]: the same as `TwoSliceDBN.sample` on the same uniform numbers.
+        [B, N] of that type: the same as `TwoSliceDBN.sample` on the same uniform numbers.
     """
     if codes.shape != uniforms.shape or codes.shape[:1] != actions.shape:
         raise UserError(
@@ -142,7 +143,7 @@ def sample_codes(tables: Packed, codes: np.ndarray, actions: np.ndarray, uniform
         tables.parents,
         tables.strides,
         tables.order,
-        np.ascontiguousarray(codes, dtype=np.uint8),
+        np.ascontiguousarray(codes, dtype=code_type(tables.cumulative.shape[1])),
         np.ascontiguousarray(actions, dtype=np.int64),
         np.ascontiguousarray(uniforms, dtype=np.float64),
     )

@@ -55,7 +55,7 @@ class ParticleFilter:
         Raises:
             UserError: no codes, or codes of another model.
         """
-        codes = self.dbn._codes(codes).astype(np.uint8)
+        codes = self.dbn._codes(codes).astype(self.dbn.code_type)
         if codes.ndim != 2 or not len(codes):
             raise UserError("a particle filter starts from at least one code, integers [n, N]")
         return Particles(codes, np.full(len(codes), 1.0 / len(codes)))

@@ -13,7 +13,7 @@ import numpy as np
 
 from nesy.dbn.inference.exact import ancestors
 from nesy.dbn.model import TwoSliceDBN
-from nesy.dbn.rows import unique_rows
+from nesy.dbn.rows import code_type, unique_rows
 from nesy.errors import UserError
 
 MAX_CODES = 1 << 21
@@ -84,7 +84,7 @@ def follow(
     weights = np.ones(1)
     for step, action in enumerate(plan):
         codes, weights = step_codes(dbn, codes, weights, int(action), needed[step + 1], most, drop)
-    return codes.astype(np.uint8), weights
+    return codes.astype(dbn.code_type), weights
 
 
 def step_codes(
@@ -168,13 +168,13 @@ def reached(
         codes, weights = step_codes(dbn, codes, weights, int(action), slices[step + 1], most, visit=visit)
         rows.append(used)
         values.append(found)
-    return Reached(slices, values, rows, codes.astype(np.uint8), weights)
+    return Reached(slices, values, rows, codes.astype(dbn.code_type), weights)
 
 
 def _merged(
     now: np.ndarray, later: np.ndarray, weights: np.ndarray, num_values: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    both = np.column_stack([now, later]).astype(np.uint8)
+    both = np.column_stack([now, later]).astype(code_type(num_values))
     first, index, _ = unique_rows(both)
     return now[first], later[first], np.bincount(index, weights)
 

@@ -15,8 +15,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from nesy.checked_arrays import integers
 from nesy.config import ExtractConfig
+from nesy.dbn.checked_steps import Steps
 from nesy.dbn.codebook import Codebook, distinct_views, named_meanings, value_meanings
 from nesy.dbn.model import Parents, TwoSliceDBN
 from nesy.dbn.rows import unique_rows
@@ -102,6 +105,7 @@ def extract(
         [np.asarray(model.conditional(a, i), dtype=np.float64) for i in range(len(per_action))]
         for a, per_action in enumerate(structure.parents_now)
     ]
+    size = cpts[0][0].shape[-1]
     dbn = TwoSliceDBN.from_tables(
         cpts,
         structure.parents_now,
@@ -109,7 +113,7 @@ def extract(
         order=structure.order,
         action_names=action_names,
         factor_names=factor_names,
-        initial=None if initial_codes is None else marginals(initial_codes, cpts[0][0].shape[-1]),
+        initial=None if initial_codes is None else marginals(initial_codes, size, len(cpts[0])),
         value_meanings=meanings,
         provenance=provenance,
     )
@@ -125,16 +129,23 @@ def with_counts(
 ) -> TwoSliceDBN:
     """The same model with the number of the given transitions behind every row.
 
-    Also sets the tables `codes` uint8 [C, N], the distinct codes met, `taken` int64 [A], how often each action was
+    Also sets the tables `codes` [C, N] (of `code_type`), the distinct codes met, `taken` int64 [A], how often each action was
     taken, and `changed` int64 [A, N], in how many of its transitions each factor changed its value.
+
+    Raises:
+        UserError: the transitions are none of this model.
     """
-    weights = np.ones(len(codes), dtype=np.int64) if weights is None else np.asarray(weights, dtype=np.int64)
+    steps = Steps.of(
+        codes, actions, next_codes, weights, num_values=dbn.num_values, action_names=dbn.action_names
+    )
+    if steps.codes.shape[1] != dbn.num_factors:
+        raise UserError(f"a code of this model has {dbn.num_factors} factors, not {steps.codes.shape[1]}")
     counts = np.zeros(len(dbn.probabilities), dtype=np.int64)
     taken = np.zeros(dbn.num_actions, dtype=np.int64)
     changed = np.zeros((dbn.num_actions, dbn.num_factors), dtype=np.int64)
     for a in range(dbn.num_actions):
-        chosen = np.asarray(actions) == a
-        now, later, often = codes[chosen].astype(np.int64), next_codes[chosen].astype(np.int64), weights[chosen]
+        before, after, often = steps.under(a)
+        now, later = before.astype(np.int64), after.astype(np.int64)
         taken[a] = often.sum()
         changed[a] = often @ (now != later)
         for i in range(dbn.num_factors):
@@ -142,17 +153,18 @@ def with_counts(
             rows = dbn.num_rows(a, i)
             # weights are far below 2^53, so the floats that bincount adds up are exact
             counts[start : start + rows] = np.bincount(dbn.rows(a, i, now, later), weights=often, minlength=rows)
-    every = np.concatenate([codes, next_codes]).astype(np.uint8)
+    every = np.concatenate([steps.codes, steps.next_codes])
     met = every[unique_rows(every)[0]]
     tables = {**dbn.tables, "codes": met, "taken": taken, "changed": changed}
     return replace(dbn, row_counts=counts, tables=tables)
 
 
-def marginals(codes: np.ndarray, num_values: int) -> np.ndarray:
-    """The marginal distribution of every factor over some codes: float64 [N, K]."""
-    if not len(codes):
+def marginals(codes: ArrayLike, num_values: int, num_factors: int) -> np.ndarray:
+    """The marginal distribution of every factor over some codes [m, N]: float64 [N, K]."""
+    known = integers(codes, "initial codes", (None, num_factors), num_values)
+    if not len(known):
         raise UserError("no codes to take an initial distribution from")
-    return np.stack([np.bincount(column, minlength=num_values) / len(codes) for column in codes.T])
+    return np.stack([np.bincount(column, minlength=num_values) / len(known) for column in known.T])
 
 
 def extract_run(run: RunFolder, domain_name: str, config: ExtractConfig | None = None) -> dict[str, Any]:

@@ -6,15 +6,20 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from nesy.checked_arrays import integers
+from nesy.dbn.checked_steps import Steps
 from nesy.dbn.codebook import Codebook
 from nesy.dbn.learning.structure import Candidates, Search, learn_parents
 from nesy.dbn.model import TwoSliceDBN
 from nesy.dbn.rows import distinct_values
 from nesy.dbn.step_tables import Parents, StepTable
+from nesy.dbn.learning.structure import Candidates, Search, learn_parents
+from nesy.errors import UserError
 
 OBSERVATION = Search(max_parents=4, exhaustive=2)
-STEPS = Search(max_parents=4, max_next=1, exhaustive=1)
+STEPS = Search(max_parents=4, max_next=4, exhaustive=2, both=True, lean=True)
 PRIOR = 1e-3
 """Observations that the mean of a table counts as in each of its rows."""
 LEVELS = 8
@@ -22,7 +27,12 @@ LEVELS = 8
 
 
 def with_observation(dbn: TwoSliceDBN, codebook: Codebook, search: Search = OBSERVATION) -> TwoSliceDBN:
-    """The model with P(cell | code) for every cell of a view, counted from the views met."""
+    """The model with P(cell | code) for every cell of a view, counted from the views met.
+
+    Raises:
+        UserError: the codebook is of another model.
+    """
+    integers(codebook.codes, "codes of the codebook", (None, dbn.num_factors), dbn.num_values)
     flat = codebook.views.reshape(len(codebook), -1)
     kinds = len(codebook.cell_kinds)
     weights = np.maximum(codebook.counts, 1).astype(np.float64)
@@ -51,34 +61,60 @@ def with_observation(dbn: TwoSliceDBN, codebook: Codebook, search: Search = OBSE
 
 def with_outcomes(
     dbn: TwoSliceDBN,
-    steps: Sequence[np.ndarray],
-    kind: np.ndarray,
-    rewards: np.ndarray,
-    terminated: np.ndarray,
+    steps: Sequence[ArrayLike],
+    kind: ArrayLike,
+    rewards: ArrayLike,
+    terminated: ArrayLike,
     search: Search = STEPS,
 ) -> TwoSliceDBN:
     """The model with the mean reward and the probability that the episode ends, given a step.
 
     Args:
         dbn: the model.
-        steps: distinct steps: codes uint8 [D, N], actions integers [D], next codes uint8 [D, N].
+        steps: distinct steps: codes [D, N], actions [D], next codes [D, N].
         kind: int64 [n]: which of them each observation belongs to.
         rewards: float [n].
         terminated: bool [n].
-        search: how parents are chosen.
+        search: how parents are chosen; by default up to 4 from each slice, as far as the score rises, and every pair
+            of the two slices is tried: an end may depend on two factors neither of which tells anything alone.
+
+    Raises:
+        UserError: the columns do not fit the model or each other.
     """
-    codes, actions, next_codes = steps
+    codes, actions, next_codes, kind, rewards, terminated = _checked(dbn, steps, kind, rewards, terminated)
     number = len(actions)
     met = np.bincount(kind, minlength=number) > 0
     both = np.column_stack([codes, next_codes])[met]
-    ended = _histogram(kind, np.asarray(terminated, dtype=np.int64), 2, number)[met]
+    ended = _histogram(kind, terminated, 2, number)[met]
     sums = np.bincount(kind, weights=rewards, minlength=number)[met]
-    levels = _histogram(kind, *_levels(np.asarray(rewards, dtype=np.float64)), number)[met]
-    where = (both, np.asarray(actions)[met], dbn)
+    levels = _histogram(kind, *_levels(rewards), number)[met]
+    taken = actions[met]
+    # the candidates are the same for both tables: what is computed of them alone is computed once
+    candidates = [Candidates(both[taken == a]) for a in range(dbn.num_actions)]
+    where = (both, taken, dbn, candidates)
     termination = _table(where, ("done",), ("goes_on", "ends"), ended, ended, search)
     moments = np.column_stack([sums, levels.sum(axis=1)])
     reward = _table(where, ("reward",), (), levels, moments, search)
     return replace(dbn, step_tables={**dbn.step_tables, "reward": reward, "termination": termination})
+
+
+def _checked(
+    dbn: TwoSliceDBN, steps: Sequence[ArrayLike], kind: ArrayLike, rewards: ArrayLike, terminated: ArrayLike
+) -> tuple[np.ndarray, ...]:
+    known = Steps.of(*steps, num_values=dbn.num_values, action_names=dbn.action_names)
+    if known.codes.shape[1] != dbn.num_factors:
+        raise UserError(f"a code of this model has {dbn.num_factors} factors, not {known.codes.shape[1]}")
+    which = integers(kind, "kinds of steps", (None,), len(known.actions))
+    if not len(which):
+        raise UserError("no steps to learn rewards and ends from")
+    ends = integers(terminated, "`terminated`", (len(which),), 2)
+    try:
+        gained = np.asarray(rewards, dtype=np.float64)
+    except (TypeError, ValueError):
+        gained = np.full(len(which), np.nan)
+    if gained.shape != (len(which),) or not np.isfinite(gained).all():
+        raise UserError(f"rewards must be {len(which)} finite numbers, one per step")
+    return known.codes, known.actions, known.next_codes, which, gained, ends
 
 
 def _levels(rewards: np.ndarray) -> tuple[np.ndarray, int]:
@@ -100,7 +136,7 @@ def _histogram(kind: np.ndarray, outcome: np.ndarray, size: int, number: int) ->
 
 
 def _table(
-    steps: tuple[np.ndarray, np.ndarray, TwoSliceDBN],
+    steps: tuple[np.ndarray, np.ndarray, TwoSliceDBN, list[Candidates]],
     targets: tuple[str, ...],
     outcomes: tuple[str, ...],
     histogram: np.ndarray,
@@ -108,7 +144,7 @@ def _table(
     search: Search,
 ) -> StepTable:
     """One target per action: parents by the histogram's score; rows are shares of it, or means of (sum, count)."""
-    both, action, dbn = steps
+    both, action, dbn, candidates = steps
     n, k = dbn.num_factors, dbn.num_values
     parents: list[tuple[int, ...]] = []
     rows, counts = [], []
@@ -118,7 +154,7 @@ def _table(
         weights = histogram[here].sum(axis=1)
         child = histogram[here] / weights[:, None]
         varies = (histogram[here].sum(axis=0) > 0).sum() > 1
-        chosen = learn_parents(both[here], child, weights, k, (n, 2 * n), search) if varies else ()
+        chosen = learn_parents(candidates[a], child, weights, k, (n, 2 * n), search) if varies else ()
         parents.append(chosen)
         table, met = _rows(both[here][:, list(chosen)], sums[here], k)
         total = table.sum(axis=0) if here.any() else whole

@@ -39,7 +39,14 @@ class Search:
     max_next: int = 0
     """Most parents from slice t+1."""
     exhaustive: int = 2
-    """Parent sets from slice t up to this size are all tried; larger ones grow parent by parent."""
+    """Parent sets up to this size are all tried, of slice t or, with `both`, of both slices; larger ones grow parent
+    by parent."""
+    both: bool = False
+    """Whether parents of slice t+1 are as likely as those of slice t."""
+    lean: bool = False
+    """Whether parents go without which the steps met fall into the same rows: BDeu likes such copies of others."""
+    max_rows: int = 1 << 20
+    """Most rows of a table: factors of many values have fewer parents."""
 
 
 class Candidates:
@@ -96,6 +103,8 @@ def learn_parents(
     known: dict[tuple[int, ...], float] = {}
     shared = candidates if isinstance(candidates, Candidates) else Candidates(candidates)
     number = len(shared.merged)
+    if not number:
+        return ()
     counts = np.stack(
         [np.bincount(shared.index, weights * column, minlength=number) for column in child.T if column.any()], axis=1
     )
@@ -103,7 +112,8 @@ def learn_parents(
 
     def allowed(chosen: tuple[int, ...]) -> bool:
         later = sum(c >= split for c in chosen)
-        return later <= search.max_next and len(chosen) - later <= search.max_parents
+        few = later <= search.max_next and len(chosen) - later <= search.max_parents
+        return few and num_values ** len(chosen) <= search.max_rows
 
     def score(chosen: tuple[int, ...]) -> float:
         if chosen not in known:
@@ -111,9 +121,19 @@ def learn_parents(
             known[chosen] = _score(shared.groups(chosen), counts, size, rows, search)
         return known[chosen]
 
-    depth = min(search.exhaustive, search.max_parents)
-    best = max((c for size in range(depth + 1) for c in itertools.combinations(range(split), size)), key=score)
-    return _climb(best, range(total), allowed, score)
+    tried = range(total if search.both else split)
+    sets = (c for depth in range(search.exhaustive + 1) for c in itertools.combinations(tried, depth))
+    best = _climb(max(filter(allowed, sets), key=score), range(total), allowed, score)
+    return _lean(best, shared) if search.lean else best
+
+
+def _lean(chosen: tuple[int, ...], candidates: Candidates) -> tuple[int, ...]:
+    """The parents without those that tell no two of the combinations apart that the others do not."""
+    for one in reversed(chosen):
+        rest = tuple(c for c in chosen if c != one)
+        if candidates.groups(rest).max(initial=0) == candidates.groups(chosen).max(initial=0):
+            chosen = rest
+    return chosen
 
 
 def _climb(
