@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from nesy.checked_arrays import integers
 from nesy.dbn import storage
-from nesy.dbn.rows import unique_rows
+from nesy.dbn.rows import code_type, unique_rows
 from nesy.errors import UserError
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ class Codebook:
     views: np.ndarray
     """uint8 [V, v, v]: the views, indexed [vx, vy]."""
     codes: np.ndarray
-    """uint8 [V, N]: the code of each view."""
+    """[V, N]: the code of each view; uint8 where no factor has more than 256 values."""
     counts: np.ndarray
     """int64 [V]: how often each view was met."""
     predicates: np.ndarray
@@ -60,11 +61,17 @@ class Codebook:
     ) -> Codebook:
         """Make a codebook, with the truth of every predicate of `vocabulary` on every view.
 
+        Args:
+            views: [V, v, v], whole numbers below 256: the kind of every cell.
+            codes: [V, N].
+            counts: [V].
+            vocabulary: names the predicates; None for none.
+
         Raises:
-            UserError: views, codes or counts are no whole numbers in their range.
+            UserError: other numbers, or columns of different lengths.
         """
-        views, codes = _whole("views", views, np.uint8), _whole("codes", codes, np.uint8)
-        counts = _whole("counts", counts, np.int64)
+        views = integers(views, "views of a codebook", (None, None, None), 256).astype(np.uint8, copy=False)
+        codes = integers(codes, "codes of a codebook", (len(views), None))
         names = tuple(vocabulary.names) if vocabulary is not None else ()
         truth = (
             np.asarray(vocabulary.evaluate(views), dtype=bool)
@@ -74,8 +81,8 @@ class Codebook:
         meanings = tuple(vocabulary.meanings.get(name, "") for name in names) if vocabulary is not None else ()
         return cls(
             views=views,
-            codes=codes,
-            counts=counts,
+            codes=codes.astype(code_type(int(codes.max(initial=0)) + 1), copy=False),
+            counts=integers(counts, "counts of a codebook", (len(views),)).astype(np.int64, copy=False),
             predicates=truth,
             predicate_names=names,
             predicate_meanings=meanings,
@@ -132,7 +139,7 @@ class Codebook:
         try:
             return cls(
                 views=_typed(arrays["views"], np.uint8),
-                codes=_typed(arrays["codes"], np.uint8),
+                codes=_typed(arrays["codes"], np.unsignedinteger),
                 counts=_typed(arrays["counts"], np.int64),
                 predicates=_typed(arrays["predicates"], np.bool_),
                 predicate_names=tuple(str(name) for name in document["predicate_names"]),
@@ -145,19 +152,9 @@ class Codebook:
             raise UserError(f"{path}: does not describe a codebook ({error!r})") from None
 
 
-def _whole(what: str, values: np.ndarray, dtype: type[np.integer]) -> np.ndarray:
-    """Values as whole numbers of some type, none of which changes by that."""
-    array, range_ = np.asarray(values), np.iinfo(dtype)
-    with np.errstate(invalid="ignore"):
-        fits = array.dtype.kind in "biuf" and bool(((array >= 0) & (array <= range_.max) & (array % 1 == 0)).all())
-    if not fits:
-        raise UserError(f"{what} of a codebook must be whole numbers from 0 to {range_.max}, found {array.dtype}")
-    return array.astype(dtype)
-
-
 def _typed(array: np.ndarray, dtype: type[np.generic]) -> np.ndarray:
-    if array.dtype != dtype:
-        raise ValueError(f"expected {np.dtype(dtype)}, found {array.dtype}")
+    if not np.issubdtype(array.dtype, dtype):
+        raise ValueError(f"expected {dtype.__name__}, found {array.dtype}")
     return array
 
 

@@ -14,7 +14,7 @@ from nesy.dbn.codebook import Codebook
 from nesy.dbn.learning.structure import Candidates, Search, learn_parents
 from nesy.dbn.model import TwoSliceDBN
 from nesy.dbn.rows import distinct_values
-from nesy.dbn.step_tables import Parents, StepTable
+from nesy.dbn.step_tables import MAX_ENTRIES, Parents, StepTable
 from nesy.dbn.learning.structure import Candidates, Search, learn_parents
 from nesy.errors import UserError
 
@@ -149,6 +149,8 @@ def _table(
     parents: list[tuple[int, ...]] = []
     rows, counts = [], []
     whole = sums.sum(axis=0)
+    room = MAX_ENTRIES // (dbn.num_actions * max(1, len(outcomes)))
+    search = replace(search, max_rows=min(search.max_rows, room))
     for a in range(dbn.num_actions):
         here = action == a
         weights = histogram[here].sum(axis=1)

@@ -2,11 +2,16 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from nesy.dbn.evaluation.measures import fidelity
-from nesy.dbn.evaluation.recovery import compare_arcs, random_model, random_transitions, recover
+from nesy.dbn.codebook import Codebook
 from nesy.dbn.learning.extraction import extract
 from nesy.dbn.learning.fitting import from_callable, from_experience
+from nesy.dbn.evaluation.measures import fidelity
+from nesy.dbn.model import TwoSliceDBN
+from nesy.dbn.evaluation.recovery import compare_arcs, random_model, random_transitions, recover
+from nesy.dbn.learning.step_learning import with_observation, with_outcomes
 from nesy.dbn.learning.structure import Search
 from nesy.errors import UserError
 from tests.nesy.dbn.models import random_dbn
@@ -163,3 +168,244 @@ def test_distinct_transitions_stand_for_all():
     np.testing.assert_array_equal(whole.row_counts, short.row_counts)
     for name in ("codes", "taken", "changed"):
         np.testing.assert_array_equal(whole.tables[name], short.tables[name])
+
+
+CODES = np.array([[0, 1], [1, 0], [1, 1]] * 10)
+ACTIONS = np.array([0, 1, 0] * 10)
+LATER = CODES[::-1].copy()
+WRONG = {
+    "a negative code": ((np.where(CODES == 0, -1, CODES), ACTIONS, LATER), {}, "codes are whole numbers in 0..1, found"),
+    "a negative next code": ((CODES, ACTIONS, np.where(LATER == 0, -1, LATER)), {}, "next codes .* in 0..1, found -1"),
+    "a next code too large": ((CODES, ACTIONS, 5 * LATER), {}, "next codes .* found 5"),
+    "a code too large": ((2 * CODES, ACTIONS, LATER), {}, "codes .* found 2"),
+    "an action beyond the last": ((CODES, 7 * ACTIONS, LATER), {"num_actions": 2}, "actions .* 0..1, found 7"),
+    "a negative action": ((CODES, ACTIONS - 1, LATER), {}, "actions .* found -1"),
+    "an action without a name": ((CODES, 2 * ACTIONS, LATER), {"action_names": ("x", "y")}, "actions .* 0..1, found 2"),
+    "names without a list of them": ((CODES, np.array(["go", "stay", "go"] * 10), LATER), {}, "action_names must list"),
+    "an unknown name": ((CODES, ["go"] * 30, LATER), {"action_names": ("x", "y")}, "'go' is no action; .* x, y"),
+    "two numbers of actions": ((CODES, ACTIONS, LATER), {"action_names": ("x", "y"), "num_actions": 3}, "num_actions is 3"),
+    "no actions": ((CODES, ACTIONS, LATER), {"num_actions": 0}, "num_actions is a whole number from 1"),
+    "half codes": ((0.5 * CODES, ACTIONS, LATER), {}, "found 0.5"),
+    "no number": ((np.where(CODES == 0, np.nan, CODES), ACTIONS, LATER), {}, "found nan"),
+    "texts": ((CODES.astype(str), ACTIONS, LATER), {}, "codes are whole numbers"),
+    "rows of two lengths": (([[0, 1], [1]], [0, 1], [[0, 1], [1, 0]]), {}, "different lengths"),
+    "one dimension": ((CODES[:, 0], ACTIONS, LATER[:, 0]), {}, r"shape \[any, any\], found \[30\]"),
+    "too few actions": ((CODES, ACTIONS[:20], LATER), {}, r"actions have the shape \[30\], found \[20\]"),
+    "too few next codes": ((CODES, ACTIONS, LATER[:20]), {}, r"next codes have the shape \[30, 2\]"),
+    "other factors": ((CODES, ACTIONS, LATER[:, :1]), {}, r"next codes have the shape \[30, 2\]"),
+    "half weights": ((CODES, ACTIONS, LATER), {"weights": np.full(30, 0.5)}, "weights .* found 0.5"),
+    "weights that are no numbers": ((CODES, ACTIONS, LATER), {"weights": [np.nan] * 30}, "weights .* found nan"),
+    "negative weights": ((CODES, ACTIONS, LATER), {"weights": [-1] * 30}, "weights .* found -1"),
+    "too few weights": ((CODES, ACTIONS, LATER), {"weights": [1] * 29}, "weights"),
+    "no weight": ((CODES, ACTIONS, LATER), {"weights": [0] * 30}, "all weights are 0"),
+    "too much weight": ((CODES, ACTIONS, LATER), {"weights": [1 << 60] * 30}, "more transitions than can be counted"),
+    "no values": ((CODES, ACTIONS, LATER), {"num_values": 0}, "num_values is a whole number from 1"),
+    "half a value": ((CODES, ACTIONS, LATER), {"num_values": 2.5}, "num_values is a whole number"),
+    "names of other factors": ((CODES, ACTIONS, LATER), {"factor_names": ("x",)}, "2 factors need as many factor_names"),
+    "other initial codes": ((CODES, ACTIONS, LATER), {"initial_codes": [[2, 0]]}, "initial codes .* found 2"),
+    "initial codes of fewer factors": ((CODES, ACTIONS, LATER), {"initial_codes": [[0]]}, "initial codes have"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("mistake", sorted(WRONG))
+@pytest.mark.parametrize("way", ["experience", "callable"])
+def test_columns_that_cannot_be_counted_are_refused_in_one_line(mistake, way):
+    columns, options, message = WRONG[mistake]
+    options = {"num_values": 2, **options}
+    with pytest.raises(UserError, match=message) as caught:
+        if way == "experience":
+            from_experience(*columns, **options)
+        else:
+            from_callable(lambda codes, action: np.full((len(codes), 2, 2), 0.5), *columns, **options)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("fit", [from_experience, from_callable])
+def test_a_misspelt_keyword_is_refused(fit):
+    with pytest.raises(TypeError, match="factor_name"):
+        fit(CODES, ACTIONS, LATER, num_values=2, factor_name=("x", "y"))
+
+
+def test_columns_in_other_forms_are_the_same_where_they_are_exact():
+    expected = from_experience(CODES, ACTIONS, LATER, num_values=2, weights=np.arange(30))
+    forms = (
+        (CODES.tolist(), ACTIONS.tolist(), LATER.tolist(), np.arange(30).tolist()),
+        (CODES.astype(bool), ACTIONS.astype(float), LATER.astype(np.float32), np.arange(30.0)),
+        (CODES.astype(np.uint8), ACTIONS.astype(np.int8), LATER.astype(object), np.arange(30, dtype=np.uint64)),
+        (CODES[1:], ACTIONS[1:], LATER[1:], np.arange(1, 30)),  # met 0 times is not met
+    )
+    for *columns, weights in forms:
+        found = from_experience(*columns, num_values=2, weights=weights)
+        assert found.parents_now == expected.parents_now
+        np.testing.assert_array_equal(found.probabilities, expected.probabilities)
+        np.testing.assert_array_equal(found.row_counts, expected.row_counts)
+        for name in ("codes", "taken", "changed"):
+            np.testing.assert_array_equal(found.tables[name], expected.tables[name])
+    names = np.array(["x", "y"])[ACTIONS]
+    named = from_experience(CODES, names, LATER, num_values=2, action_names=("x", "y"), weights=np.arange(30))
+    np.testing.assert_array_equal(named.probabilities, expected.probabilities)
+
+
+@given(st.integers(1, 3), st.integers(1, 5), st.integers(1, 4), st.integers(0, 2**32 - 1))
+@settings(max_examples=40, deadline=None)
+def test_rows_are_the_counted_shares(factors, values, actions, seed):
+    """Against plain counting in dictionaries: whatever parents are chosen, rows and counts are those of the steps."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 60))
+    codes, later = rng.integers(0, values, (2, n, factors))
+    taken, often = rng.integers(0, actions, n), rng.integers(0, 4, n)
+    often[0] = 1
+    dbn = from_experience(codes, taken, later, num_values=values, num_actions=actions, weights=often, prior_count=1e-9)
+    assert dbn.tables["taken"].tolist() == [int(often[taken == a].sum()) for a in range(actions)]
+    for a in range(actions):
+        for i in range(factors):
+            counted: dict[int, np.ndarray] = {}
+            for row in np.flatnonzero((taken == a) & (often > 0)):
+                key = 0
+                for where, parent in dbn.parents(a, i):
+                    key = key * values + int((codes, later)[where][row, parent])
+                counted.setdefault(key, np.zeros(values))[later[row, i]] += often[row]
+            for key in range(dbn.num_rows(a, i)):
+                mass = counted.get(key, np.zeros(values))
+                assert dbn.counts(a, i)[key] == mass.sum()
+                if mass.sum():
+                    np.testing.assert_allclose(dbn.cpt(a, i)[key], mass / mass.sum(), atol=1e-6)
+
+
+def test_an_action_never_taken_has_rows_never_met():
+    dbn = from_experience(CODES, 2 * ACTIONS, LATER, num_values=2, num_actions=4)
+    assert dbn.tables["taken"].tolist() == [20, 0, 10, 0]
+    for a in (1, 3):
+        for i in range(2):
+            assert dbn.parents(a, i) == () and dbn.counts(a, i).tolist() == [0]
+            np.testing.assert_allclose(dbn.cpt(a, i)[0], np.bincount(LATER[:, i]) / 30)
+
+
+@pytest.mark.parametrize("values", [256, 257, 300, 70_000 // 64])
+def test_factors_may_have_many_values(values, tmp_path):
+    codes = np.repeat(np.arange(values), 20)[:, None]
+    dbn = from_experience(codes, np.zeros(len(codes), int), (codes + 1) % values, num_values=values, prior_count=1e-6)
+    assert dbn.parents(0, 0) == ((0, 0),)
+    np.testing.assert_array_equal(dbn.cpt(0, 0).argmax(1), (np.arange(values) + 1) % values)
+    np.testing.assert_array_equal(dbn.tables["codes"], np.arange(values)[:, None])
+    every = np.arange(values)[:, None]
+    np.testing.assert_array_equal(dbn.sample(every, 0, np.random.default_rng(0)), (every + 1) % values)
+    from nesy.dbn.inference import likely_next
+    from nesy.dbn.kernels import packed, sample_codes
+
+    np.testing.assert_array_equal(likely_next(dbn, every, 0)[0][:, 0], (every + 1) % values)
+    drawn = sample_codes(packed(dbn), every, np.zeros(values, int), np.full((values, 1), 0.5))
+    np.testing.assert_array_equal(drawn, (every + 1) % values)
+    dbn.save(tmp_path / "dbn")
+    np.testing.assert_array_equal(type(dbn).load(tmp_path / "dbn").probabilities, dbn.probabilities)
+
+
+def test_tables_are_as_large_as_their_limit_allows():
+    rng = np.random.default_rng(0)
+    codes = rng.integers(0, 60, (4000, 3))
+    later = np.column_stack([codes.sum(1) % 60, codes[:, 1], codes[:, 2]])
+    dbn = from_experience(codes, np.zeros(4000, int), later, num_values=60, search=Search(max_rows=3600))
+    assert max(len(dbn.parents(0, i)) for i in range(3)) <= 2
+
+
+def test_transitions_of_another_model_are_not_counted():
+    from nesy.dbn.extraction import with_counts
+
+    dbn = from_experience(CODES, ACTIONS, LATER, num_values=2)
+    for columns, message in (
+        ((CODES[:, :1], ACTIONS, LATER[:, :1]), "has 2 factors, not 1"),
+        ((2 * CODES, ACTIONS, LATER), "codes are whole numbers in 0..1"),
+        ((CODES, ACTIONS + 1, LATER), "actions are whole numbers in 0..1, found 2"),
+    ):
+        with pytest.raises(UserError, match=message):
+            with_counts(dbn, *columns)
+
+
+@pytest.mark.parametrize(
+    ("tables", "parents", "message"),
+    [
+        ([[np.full((3, 3), 1 / 3), np.full((2, 2), 0.5)]], [[(0,), (1,)]], "factor 1 under action 0 is of 2 values"),
+        ([[np.full((2, 2), 0.5), np.full((1, 4), 0.25)]], [[(0,), (1,)]], "factor 1 under action 0 is of 4 values"),
+        ([[np.full((4, 2), 0.5), np.full((2, 2), 0.5)]], [[(0,), (0, 1)]], "must have 2 rows for its parents, found 4"),
+        ([[np.full((2, 2), 0.5)] * 2, [np.full((2, 2), 0.5)]], [[(0,), (1,)], [(0,)]], "action 1 has 1 tables"),
+        ([[np.full(2, 0.5)]], [[()]], r"shape \[rows, K\], found \[2\]"),
+        ([[[[0.5, 0.5], [1.0]]]], [[(0,)]], "must be numbers"),
+        ([[np.full((2, 2), 0.5)]], [[(0,), (1,)]], "one entry per action and factor"),
+    ],
+)
+def test_tables_that_do_not_fit_are_not_reshaped(tables, parents, message):
+    with pytest.raises(UserError, match=message):
+        TwoSliceDBN.from_tables(tables, parents)
+
+
+# ------------------------------------------------------------------ reward and end
+def _ends(done: np.ndarray, codes: np.ndarray, later: np.ndarray, values: int) -> tuple[TwoSliceDBN, float]:
+    """A model with outcomes, and the largest error of P(ends) on its steps."""
+    actions = np.zeros(len(codes), int)
+    dbn = with_outcomes(
+        from_experience(codes, actions, later, num_values=values),
+        (codes, actions, later), np.arange(len(codes)), 2.0 * done - 1.0, done,
+    )  # fmt: skip
+    found = dbn.step_tables["termination"].look_up(codes, actions, later)[:, 0, 1]
+    rewards = dbn.step_tables["reward"].look_up(codes, actions, later)[:, 0, 0]
+    return dbn, max(float(np.abs(found - done).max()), float(np.abs(rewards - (2.0 * done - 1.0)).max()) / 2)
+
+
+@pytest.mark.parametrize("rule", ["cells", "parity", "three", "both slices", "lines", "never"])
+def test_an_end_may_depend_on_several_factors_reached(rule):
+    rng = np.random.default_rng(0)
+    codes = rng.integers(0, 4, (20_000, 4))
+    later = np.clip(codes + rng.integers(-1, 2, codes.shape), 0, 3)
+    done, parents = {
+        "cells": ((later[:, 0] + later[:, 1]) % 3 == 0, {(1, 0), (1, 1)}),
+        "parity": ((later[:, 0] + later[:, 1]) % 2 == 0, {(1, 0), (1, 1)}),
+        "three": ((later[:, 0] == 1) & (later[:, 1] == 2) & (later[:, 3] > 0), {(1, 0), (1, 1), (1, 3)}),
+        "both slices": ((codes[:, 2] + later[:, 1]) % 2 == 0, {(0, 2), (1, 1)}),
+        "lines": (later[:, 3] == 0, {(1, 3)}),
+        "never": (later[:, 3] < 0, set()),
+    }[rule]  # fmt: skip
+    dbn, error = _ends(done, codes, later, 4)
+    assert error < 0.01
+    for name in ("termination", "reward"):
+        assert set(dbn.step_tables[name].parents(0, 0)) == parents
+
+
+def test_copies_of_a_parent_are_left_out():
+    rng = np.random.default_rng(1)
+    codes = rng.integers(0, 4, (5000, 1))
+    later = rng.integers(0, 4, (5000, 1))
+    codes, later = np.repeat(codes, 3, 1), np.repeat(later, 3, 1)
+    dbn, error = _ends((codes[:, 0] + later[:, 0]) % 3 == 0, codes, later, 4)
+    assert error < 0.01 and len(dbn.step_tables["termination"].parents(0, 0)) == 2
+
+
+def test_outcomes_that_do_not_fit_are_refused():
+    dbn = from_experience(CODES, ACTIONS, LATER, num_values=2)
+    steps, kind, rewards, ends = (CODES, ACTIONS, LATER), np.arange(30), np.zeros(30), np.zeros(30, bool)
+    for given_steps, columns, message in (
+        (steps, (kind + 1, rewards, ends), "kinds of steps .* found 30"),
+        (steps, (kind - 1, rewards, ends), "kinds of steps .* found -1"),
+        (steps, (kind, rewards[:20], ends), "rewards must be 30"),
+        (steps, (kind, rewards * np.nan, ends), "rewards must be 30 finite"),
+        (steps, (kind, rewards, ends + 2), "terminated"),
+        (steps, (kind[:0], rewards[:0], ends[:0]), "no steps"),
+        ((CODES, ACTIONS + 1, LATER), (kind, rewards, ends), "actions .* found 2"),
+        ((CODES[:, :1], ACTIONS, LATER[:, :1]), (kind, rewards, ends), "2 factors, not 1"),
+    ):
+        with pytest.raises(UserError, match=message):
+            with_outcomes(dbn, given_steps, *columns)
+
+
+def test_a_codebook_holds_whole_numbers():
+    codes = np.zeros((2, 1), dtype=np.uint8)
+    with pytest.raises(UserError, match="views are whole numbers"):
+        Codebook.build(np.full((2, 1, 1), 0.5), codes, np.ones(2), None)
+    with pytest.raises(UserError, match="views are whole numbers"):
+        Codebook.build(np.full((2, 1, 1), 256), codes, np.ones(2), None)
+    with pytest.raises(UserError, match="codes are whole numbers"):
+        Codebook.build(np.zeros((2, 1, 1)), codes - 0.5, np.ones(2), None)
+    wide = Codebook.build(np.zeros((2, 1, 1)), np.array([[1], [300]]), np.ones(2), None)
+    assert wide.codes.tolist() == [[1], [300]]
+    dbn = from_experience(CODES, ACTIONS, LATER, num_values=2)
+    with pytest.raises(UserError, match="codes of the codebook"):
+        with_observation(dbn, wide)
