@@ -1,4 +1,4 @@
-"""Steps given from outside as columns: what cannot be counted is refused here, before it is counted as something else."""
+"""Steps given from outside as columns: what cannot be counted is refused before it is counted as something else."""
 
 from __future__ import annotations
 
@@ -73,8 +73,10 @@ class Steps:
         if not met.any():
             raise UserError("a 2DBN needs at least one transition that was met: all weights are 0")
         kind = code_type(number)
-        columns = (before.astype(kind, copy=False), taken, after.astype(kind, copy=False), often)
-        return cls(*(columns if met.all() else (column[met] for column in columns)), number, total)
+        before, after = before.astype(kind, copy=False), after.astype(kind, copy=False)
+        if not met.all():
+            before, taken, after, often = before[met], taken[met], after[met], often[met]
+        return cls(before, taken, after, often, number, total)
 
     def under(self, action: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Codes, next codes and weights of the steps with one action."""

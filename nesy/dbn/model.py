@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nesy.checked_arrays import integers
+from nesy.dbn.checked_tables import check_rows, flat_tables
 from nesy.dbn.rows import code_type
 from nesy.dbn.step_tables import NAMES, StepTable
 from nesy.errors import UserError
@@ -99,17 +100,17 @@ class TwoSliceDBN:
         num_actions, num_factors = len(cpts), len(cpts[0]) if cpts else 0
         if not num_actions or not num_factors:
             raise UserError("a 2DBN needs at least one action and one factor")
-        flat, num_values = _flat_tables(cpts)
+        flat, num_values = flat_tables(cpts)
         now = tuple(tuple(tuple(int(p) for p in ps) for ps in per_action) for per_action in parents_now)
         nxt = (
             tuple(tuple(tuple(int(p) for p in ps) for ps in per_action) for per_action in parents_next)
             if parents_next is not None
             else tuple(((),) * num_factors for _ in range(num_actions))
         )
-        _check_rows(cpts, "rows", now, nxt, num_values)
+        check_rows(cpts, "rows", now, nxt, num_values)
         visits = np.zeros(len(flat), dtype=np.int64)
         if counts is not None:
-            _check_rows(counts, "counts", now, nxt, num_values)
+            check_rows(counts, "counts", now, nxt, num_values)
             visits = np.concatenate([integers(c, "counts", (None,)).astype(np.int64) for cs in counts for c in cs])
         for what, names, number in (("factor", factor_names, num_factors), ("action", action_names, num_actions)):
             if names and len(names) != number:
@@ -378,51 +379,6 @@ class TwoSliceDBN:
         if found.ndim:
             raise UserError(f"one action is needed, not {action!r}")
         return int(found)
-
-
-def _flat_tables(cpts: Sequence[Sequence[np.ndarray]]) -> tuple[np.ndarray, int]:
-    """All rows float64 [rows, K] of tables [A][N], and K.
-
-    Raises:
-        UserError: they are none of one model.
-    """
-    num_factors = len(cpts[0])
-    tables = []
-    for a, per_action in enumerate(cpts):
-        if len(per_action) != num_factors:
-            raise UserError(f"action {a} has {len(per_action)} tables, action 0 has {num_factors}: one per factor")
-        for i, table in enumerate(per_action):
-            where = f"the table of factor {i} under action {a}"
-            try:
-                rows = np.asarray(table, dtype=np.float64)
-            except (TypeError, ValueError):
-                raise UserError(f"{where} must be numbers [rows, K]") from None
-            if rows.ndim != 2 or not rows.shape[1]:
-                raise UserError(f"{where} must have the shape [rows, K], found {list(rows.shape)}")
-            if tables and rows.shape[1] != tables[0].shape[1]:
-                raise UserError(
-                    f"{where} is of {rows.shape[1]} values and those before of {tables[0].shape[1]}: all factors of "
-                    "a 2DBN have as many; pad the smaller ones with values that never occur"
-                )
-            tables.append(rows)
-    return np.concatenate(tables), tables[0].shape[1]
-
-
-def _check_rows(
-    tables: Sequence[Sequence[np.ndarray]], what: str, now: Parents, later: Parents, num_values: int
-) -> None:
-    """Whether every table has a row per combination of its parents' values: too many in one would shift the others."""
-    for a, per_action in enumerate(tables):
-        for i, table in enumerate(per_action):
-            try:
-                wanted = num_values ** (len(now[a][i]) + len(later[a][i]))
-            except IndexError:
-                raise UserError("parents_now and parents_next must have one entry per action and factor") from None
-            if len(table) != wanted:
-                raise UserError(
-                    f"the table of factor {i} under action {a} must have {wanted} {what} for its parents, "
-                    f"found {len(table)}"
-                )
 
 
 def topological_order(parents_next: Parents, num_factors: int) -> tuple[int, ...]:

@@ -129,15 +129,13 @@ def with_counts(
 ) -> TwoSliceDBN:
     """The same model with the number of the given transitions behind every row.
 
-    Also sets the tables `codes` [C, N] (of `code_type`), the distinct codes met, `taken` int64 [A], how often each action was
-    taken, and `changed` int64 [A, N], in how many of its transitions each factor changed its value.
+    Also sets the tables `codes` [C, N] (of `code_type`), the distinct codes met, `taken` int64 [A], how often each
+    action was taken, and `changed` int64 [A, N], in how many of its transitions each factor changed its value.
 
     Raises:
         UserError: the transitions are none of this model.
     """
-    steps = Steps.of(
-        codes, actions, next_codes, weights, num_values=dbn.num_values, action_names=dbn.action_names
-    )
+    steps = Steps.of(codes, actions, next_codes, weights, num_values=dbn.num_values, action_names=dbn.action_names)
     if steps.codes.shape[1] != dbn.num_factors:
         raise UserError(f"a code of this model has {dbn.num_factors} factors, not {steps.codes.shape[1]}")
     counts = np.zeros(len(dbn.probabilities), dtype=np.int64)

@@ -8,12 +8,15 @@ from hypothesis import strategies as st
 from nesy.dbn.codebook import Codebook
 from nesy.dbn.learning.extraction import extract
 from nesy.dbn.learning.fitting import from_callable, from_experience
+from nesy.dbn.inference.exact import likely_next
+from nesy.dbn.inference.kernels import packed, sample_codes
 from nesy.dbn.evaluation.measures import fidelity
 from nesy.dbn.model import TwoSliceDBN
 from nesy.dbn.evaluation.recovery import compare_arcs, random_model, random_transitions, recover
 from nesy.dbn.learning.step_learning import with_observation, with_outcomes
 from nesy.dbn.learning.structure import Search
 from nesy.errors import UserError
+from nesy.formats import export, read
 from tests.nesy.dbn.models import random_dbn
 from tests.nesy.dbn.toy import Network, experience, toy
 
@@ -174,16 +177,16 @@ CODES = np.array([[0, 1], [1, 0], [1, 1]] * 10)
 ACTIONS = np.array([0, 1, 0] * 10)
 LATER = CODES[::-1].copy()
 WRONG = {
-    "a negative code": ((np.where(CODES == 0, -1, CODES), ACTIONS, LATER), {}, "codes are whole numbers in 0..1, found"),
+    "a negative code": ((np.where(CODES == 0, -1, CODES), ACTIONS, LATER), {}, "codes are .* in 0..1, found -1"),
     "a negative next code": ((CODES, ACTIONS, np.where(LATER == 0, -1, LATER)), {}, "next codes .* in 0..1, found -1"),
     "a next code too large": ((CODES, ACTIONS, 5 * LATER), {}, "next codes .* found 5"),
     "a code too large": ((2 * CODES, ACTIONS, LATER), {}, "codes .* found 2"),
     "an action beyond the last": ((CODES, 7 * ACTIONS, LATER), {"num_actions": 2}, "actions .* 0..1, found 7"),
     "a negative action": ((CODES, ACTIONS - 1, LATER), {}, "actions .* found -1"),
     "an action without a name": ((CODES, 2 * ACTIONS, LATER), {"action_names": ("x", "y")}, "actions .* 0..1, found 2"),
-    "names without a list of them": ((CODES, np.array(["go", "stay", "go"] * 10), LATER), {}, "action_names must list"),
+    "names without a list of them": ((CODES, np.array(["go", "stay", "go"] * 10), LATER), {}, "action_names must"),
     "an unknown name": ((CODES, ["go"] * 30, LATER), {"action_names": ("x", "y")}, "'go' is no action; .* x, y"),
-    "two numbers of actions": ((CODES, ACTIONS, LATER), {"action_names": ("x", "y"), "num_actions": 3}, "num_actions is 3"),
+    "two numbers of actions": ((CODES, ACTIONS, LATER), {"action_names": ("x", "y"), "num_actions": 3}, "is 3"),
     "no actions": ((CODES, ACTIONS, LATER), {"num_actions": 0}, "num_actions is a whole number from 1"),
     "half codes": ((0.5 * CODES, ACTIONS, LATER), {}, "found 0.5"),
     "no number": ((np.where(CODES == 0, np.nan, CODES), ACTIONS, LATER), {}, "found nan"),
@@ -201,7 +204,7 @@ WRONG = {
     "too much weight": ((CODES, ACTIONS, LATER), {"weights": [1 << 60] * 30}, "more transitions than can be counted"),
     "no values": ((CODES, ACTIONS, LATER), {"num_values": 0}, "num_values is a whole number from 1"),
     "half a value": ((CODES, ACTIONS, LATER), {"num_values": 2.5}, "num_values is a whole number"),
-    "names of other factors": ((CODES, ACTIONS, LATER), {"factor_names": ("x",)}, "2 factors need as many factor_names"),
+    "names of other factors": ((CODES, ACTIONS, LATER), {"factor_names": ("x",)}, "2 factors need as many"),
     "other initial codes": ((CODES, ACTIONS, LATER), {"initial_codes": [[2, 0]]}, "initial codes .* found 2"),
     "initial codes of fewer factors": ((CODES, ACTIONS, LATER), {"initial_codes": [[0]]}, "initial codes have"),
 }  # fmt: skip
@@ -290,14 +293,14 @@ def test_factors_may_have_many_values(values, tmp_path):
     np.testing.assert_array_equal(dbn.tables["codes"], np.arange(values)[:, None])
     every = np.arange(values)[:, None]
     np.testing.assert_array_equal(dbn.sample(every, 0, np.random.default_rng(0)), (every + 1) % values)
-    from nesy.dbn.inference import likely_next
-    from nesy.dbn.kernels import packed, sample_codes
-
     np.testing.assert_array_equal(likely_next(dbn, every, 0)[0][:, 0], (every + 1) % values)
     drawn = sample_codes(packed(dbn), every, np.zeros(values, int), np.full((values, 1), 0.5))
     np.testing.assert_array_equal(drawn, (every + 1) % values)
-    dbn.save(tmp_path / "dbn")
-    np.testing.assert_array_equal(type(dbn).load(tmp_path / "dbn").probabilities, dbn.probabilities)
+    for name in ("native", "parquet", "jgum"):
+        export(dbn, tmp_path / name, name)
+        again = read(tmp_path / name, name)
+        np.testing.assert_array_equal(again.probabilities, dbn.probabilities)
+        np.testing.assert_array_equal(again.tables["codes"], dbn.tables["codes"])
 
 
 def test_tables_are_as_large_as_their_limit_allows():
