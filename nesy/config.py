@@ -5,8 +5,10 @@ Every field's docstring is its help text on the command line.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal
+
+import tyro
 
 from nesy.errors import UserError
 
@@ -93,8 +95,12 @@ class TrainConfig:
     """Code books searched at most: there is another one where the first predicts the next code too badly to pass."""
     headline: tuple[str, ...] = ("wall_ahead", "goal_visible", "opening_visible")
     """Predicates that the first named factor answers in any case, where the domain has them."""
-    mirror_images: bool = True
-    """Whether every step also counts for its mirror image, left and right exchanged."""
+    weighting: Literal["visits", "maps"] | None = None
+    """What a transition counts as: `visits`, how often it was met, or `maps`, on how many maps. By default as the world
+    declares (person following: maps), else visits."""
+    mirror_images: Annotated[bool | None, tyro.conf.arg(constructor=bool)] = None
+    """Whether every step also counts for its images under the symmetries that the world declares (person following:
+    left and right exchanged). By default where it declares any."""
     held_out: float = 0.2
     """Share of the maps kept out of training for the gates."""
     time_limit: float = 180.0
@@ -109,6 +115,27 @@ class TrainConfig:
         rates = {"learning_rate": "(0, inf)", "learning_rate_decay": "(0, 1]", "temperature": "(0, inf)"}
         whole = {"max_parents": "[1, 5]", "named_factors": "[0, 8]"}
         check_ranges(self, "train", **sizes, **weights, **rates, **whole, held_out="[0, 1)")
+        if self.weighting not in (None, "visits", "maps"):
+            raise UserError(f"train: weighting must be visits or maps, not {self.weighting!r}")
+
+    def in_world(self, world: str, weighting: Literal["visits", "maps"], symmetric: bool) -> TrainConfig:
+        """The settings with those filled in that are left to the world.
+
+        Args:
+            world: its name, for the message.
+            weighting: what it declares.
+            symmetric: whether it declares a symmetry.
+
+        Raises:
+            UserError: mirror images are asked for where no symmetry is declared.
+        """
+        if self.mirror_images and not symmetric:
+            raise UserError(
+                f"train: mirror_images: {world} declares no symmetry, so the image of a step may be none; leave it out "
+                "or say --no-mirror-images (a domain declares what holds in it as `symmetries`)"
+            )
+        mirror_images = symmetric if self.mirror_images is None else self.mirror_images
+        return replace(self, weighting=self.weighting or weighting, mirror_images=mirror_images)
 
 
 @dataclass(frozen=True)

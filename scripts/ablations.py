@@ -18,7 +18,7 @@ import numpy as np
 import torch
 import tyro
 
-from domains.core import Domain, load_domain
+from domains.core import Domain, load_domain, symmetries_of
 from nesy.cli import configuration
 from nesy.config import TrainConfig
 from nesy.run_folder import RunFolder
@@ -29,7 +29,13 @@ from nesy.world_model.codes.questions import Questions
 from nesy.world_model.codes.readability import readability
 from nesy.world_model.codes.refinement import Refiner
 from nesy.world_model.columns import Columns
-from nesy.world_model.distinct import view_keys, with_mirror
+from nesy.world_model.distinct import view_keys
+from nesy.world_model.training.gates import book_nll
+from nesy.world_model.training.held_out import HeldOut
+from nesy.world_model.images import with_images
+from nesy.world_model.codes.questions import Questions
+from nesy.world_model.codes.readability import readability
+from nesy.world_model.codes.refinement import Refiner
 from nesy.world_model.structure import Limits
 from nesy.world_model.training.gates import book_nll
 from nesy.world_model.training.held_out import HeldOut
@@ -79,13 +85,15 @@ class Data:
     """What a run has met, with or without mirror images."""
 
     def __init__(self, run: RunFolder, domain: Domain, variant: str, share: float, seed: int) -> None:
-        self.columns = Columns.mapped(run.experience, run.path)
+        self.columns = Columns.mapped(run.experience, run.path, len(domain.spec.action_names))
         self.apart = self.columns.held_out(share, np.random.default_rng(seed))
         self.seed = seed
         found = {task: reference_transitions(domain, variant, task) for task in ("crossing", "following")}
         known = [transitions.views for transitions in found.values() if transitions is not None]
         # Views are always indexed with their mirror images, so that rows can be compared.
-        self.everything = with_mirror(self.columns.transitions(views=np.concatenate(known) if known else None))
+        self.symmetries, self.weighting = symmetries_of(domain), domain.spec.weighting
+        met = self.columns.transitions(views=np.concatenate(known) if known else None, weighting=self.weighting)
+        self.everything = with_images(met, self.symmetries)
         crossing = found["crossing"]
         self.reference = self.everything if crossing is None else crossing
         self.place = np.searchsorted(view_keys(self.everything.views), view_keys(self.reference.views))
@@ -93,15 +101,18 @@ class Data:
     def learned(self, mirror: bool) -> tuple[Transitions, Transitions]:
         """All transitions, and those of maps that are not held out; both index the same views."""
         views = self.everything.views
-        plain = self.columns.transitions(views=views), self.columns.transitions(~self.apart, views=views)
+        plain = (
+            self.columns.transitions(None, views, self.weighting),
+            self.columns.transitions(~self.apart, views, self.weighting),
+        )
         if not mirror:
             return plain
-        return with_mirror(plain[0], views=views), with_mirror(plain[1], views=views)
+        return with_images(plain[0], self.symmetries, views), with_images(plain[1], self.symmetries, views)
 
 
 def codes_row(data: Data, domain: Domain, config: TrainConfig, settings: SearchSettings) -> list[str]:
     """Figures of a code book."""
-    everything, training = data.learned(config.mirror_images)
+    everything, training = data.learned(config.mirror_images is not False)
     truth = domain.predicates.evaluate(everything.views)
     questions = Questions.of(domain.predicates.names, truth, config.headline)
     arcs = 2 if config.intra_slice_arcs else 0
@@ -113,7 +124,7 @@ def codes_row(data: Data, domain: Domain, config: TrainConfig, settings: SearchS
     read = readability(book.codes, truth, domain.predicates.names)
     return [
         f"{book_nll(book, everything, data.reference, data.place, 8):.3f}",
-        f"{HeldOut(data.columns, data.apart, training, data.seed).nll(book, 8):.3f}",
+        f"{HeldOut(data.columns, data.apart, training, data.seed, data.weighting).nll(book, 8):.3f}",
         f"{len(np.unique(book.codes, axis=0))}",
         f"{read['mean_factors']:.2f}",
         f"{100 * read['single']:.0f} %",
@@ -123,8 +134,8 @@ def codes_row(data: Data, domain: Domain, config: TrainConfig, settings: SearchS
 
 def network_row(data: Data, config: TrainConfig, ingredients: Ingredients) -> list[str]:
     """Figures of networks trained by gradients alone."""
-    everything, training = data.learned(config.mirror_images)
-    held_out = HeldOut(data.columns, data.apart, training, data.seed)
+    everything, training = data.learned(config.mirror_images is not False)
+    held_out = HeldOut(data.columns, data.apart, training, data.seed, data.weighting)
     trainer = SymbolicTrainer(
         config, data.seed, everything, training, held_out, None, None, ingredients, refine_up_to=0
     )

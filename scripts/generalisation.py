@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from domains.core import load_domain
+from domains.core import load_domain, symmetries_of
+from nesy.log.collection import collect
 from nesy.config import CollectConfig, TrainConfig
 from nesy.log.collection import collect
 from nesy.log.experience import Experience
@@ -53,10 +54,13 @@ def main(arguments: Arguments) -> None:
     apart = experience.held_out_maps(arguments.test_share, np.random.default_rng(seed))
     maps = np.random.default_rng(seed).permutation(np.unique(experience.map_id[~apart]))[: arguments.most_maps]
     learned, tested = experience.select(np.isin(experience.map_id, maps)), experience.select(apart)
-    config = replace(arguments.train, held_out=0.0)
-    train(learned, config, arguments.folder / "world_model", seed, progress)
+    domain = load_domain()
+    # without the domain, or all views of the variant would be learned
+    config = replace(arguments.train, held_out=0.0, weighting=arguments.train.weighting or domain.spec.weighting)
+    train(learned, config, arguments.folder / "world_model", seed, progress, symmetries=symmetries_of(domain))
     codec = SymbolicCodec(load_world_model(arguments.folder / "world_model"))
-    test, known = transitions_of(tested), view_keys(transitions_of(learned).views)
+    test = transitions_of(tested, weighting=domain.spec.weighting)
+    known = view_keys(transitions_of(learned).views)
     new = ~np.isin(view_keys(test.views), known)
     rebuilt = (codec.views(codec.codes(test.views)) == test.views).reshape(test.num_views, -1)
     figures = {

@@ -17,16 +17,18 @@ from typing import Literal
 import numpy as np
 import tyro
 
-from domains.core import load_domain
+from domains.core import load_domain, symmetries_of
 from nesy.cli import configuration
 from nesy.log.experience import Experience
 from nesy.run_folder import RunFolder
 from nesy.world_model import Transitions, reference_transitions
 from nesy.world_model.codes.code_search import CodeSearch
+from nesy.world_model.distinct import transitions_of, view_keys
+from nesy.world_model.training.gates import limits
 from nesy.world_model.codes.questions import Questions
 from nesy.world_model.codes.readability import readability
+from nesy.world_model.images import with_images
 from nesy.world_model.codes.refinement import CodeBook, Refiner
-from nesy.world_model.distinct import transitions_of, view_keys, with_mirror
 from nesy.world_model.structure import Limits
 from nesy.world_model.tables import all_tables, log_probability
 from nesy.world_model.training.gates import limits
@@ -67,7 +69,8 @@ def main(arguments: Arguments) -> None:
     reference = reference_transitions(domain, config.variant, "crossing")
     following = reference_transitions(domain, config.variant, "following")
     views = following.views if following is not None else None
-    transitions = with_mirror(transitions_of(Experience.load(run.experience), views=views))
+    met = transitions_of(Experience.load(run.experience), views=views, weighting=domain.spec.weighting)
+    transitions = with_images(met, symmetries_of(domain))
     reference = transitions if reference is None else reference
     truth = domain.predicates.evaluate(transitions.views)
     questions = Questions.of(domain.predicates.names, truth, config.train.headline)

@@ -8,7 +8,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from domains.core import DomainSpec, OracleResult, RecordedSteps, ViewGeometry
+from domains.core import (
+    FORWARD,
+    LEFT,
+    RIGHT,
+    STAY,
+    DomainSpec,
+    OracleResult,
+    RecordedSteps,
+    Symmetry,
+    ViewGeometry,
+)
+from domains.person_following.oracles.enumeration import all_maps, all_transitions, all_views
 from domains.person_following.experts import LastSeenFollower
 from domains.person_following.metrics import belief_metrics, episode_metrics
 from domains.person_following.oracles.enumeration import all_maps, all_transitions, all_views
@@ -20,7 +31,12 @@ from domains.person_following.vector_env import PersonFollowingVectorEnv
 class PersonFollowing:
     """The domain of the paper and its variants."""
 
-    spec = DomainSpec(name="person_following", variants=tuple(VARIANTS), discounts=DISCOUNTS)
+    # The paper's model of the view is one of the world, not of where the experts that collected experience walked.
+    spec = DomainSpec(
+        name="person_following", variants=tuple(VARIANTS), discounts=DISCOUNTS, weighting="maps"
+    )
+    symmetries = (Symmetry("mirror image", (RIGHT, LEFT, FORWARD, STAY), lambda views: views[:, ::-1]),)
+    """The mirror image of a map about its diagonal is a map as likely, and left and right change places in it."""
 
     @property
     def predicates(self) -> ViewPredicates:

@@ -29,6 +29,9 @@ SOURCES = (
 """In which task, and who acted; the column `source` holds one of these. `crossing-explore` is a walk on maps as
 they are in person following, whose freed cells the generated maps of the crossing task lack."""
 
+MOST_ACTIONS = 64
+"""Actions are numbered 0 to 63 at most."""
+
 _VIEWS = ("view", "next_view", "person_view", "next_person_view")
 _POSES = ("relative_pose", "next_relative_pose")
 _SCALARS: dict[str, type[np.generic]] = {
@@ -180,27 +183,55 @@ def write_part(path: Path, columns: Mapping[str, np.ndarray | Sequence[str]]) ->
 
     Returns:
         The number of rows.
+
+    Raises:
+        UserError: what is written could not be read again: columns missing or too many, of other lengths or shapes, or
+            with values that the column's type or range does not hold.
     """
-    assert set(columns) == set(COLUMNS), sorted(set(columns) ^ set(COLUMNS))
-    rows = len(columns["action"])
-    cells = int(np.prod(np.shape(columns["view"])[1:]))
+    if set(columns) != set(COLUMNS):
+        raise UserError(f"{path}: not written, columns missing or unknown: {sorted(set(columns) ^ set(COLUMNS))}")
+    rows, shape = len(columns["action"]), np.shape(columns["view"])[1:]
+    if len(shape) != 2 or shape[0] != shape[1] or not shape[0]:
+        raise UserError(f"{path}: not written, views must be square, [n, v, v], found {list(np.shape(columns['view']))}")
+    cells = shape[0] * shape[1]
     arrays = []
     for name in COLUMNS:
+        wanted = (rows, *(shape if name in _VIEWS else (3,) if name in _POSES else ()))
         values = np.asarray(columns[name])
-        assert len(values) == rows, f"{name}: {len(values)} rows, not {rows}"
+        if values.shape != wanted:
+            raise UserError(f"{path}: not written, {name} must have the shape {list(wanted)}, found {list(values.shape)}")
         if name == "source":
+            unknown = sorted(set(np.unique(values).tolist()) - set(SOURCES))
+            if unknown:
+                raise UserError(f"{path}: not written, unknown source {unknown[0]!r} (known: {', '.join(SOURCES)})")
             arrays.append(pa.array(values.astype(object)).dictionary_encode().cast(schema(cells).field(name).type))
-        elif name in _VIEWS:
-            flat = np.ascontiguousarray(values.reshape(rows * cells), dtype=np.uint8)
-            arrays.append(pa.FixedSizeListArray.from_arrays(pa.array(flat), cells))
-        elif name in _POSES:
-            flat = np.ascontiguousarray(values.reshape(rows * 3), dtype=np.int16)
-            arrays.append(pa.FixedSizeListArray.from_arrays(pa.array(flat), 3))
-        else:
-            arrays.append(pa.array(values.astype(_SCALARS[name])))
+            continue
+        flat = _exact(path, name, values).reshape(-1)
+        width = len(flat) // rows if rows else int(np.prod(wanted[1:]))
+        arrays.append(pa.array(flat) if len(wanted) == 1 else pa.FixedSizeListArray.from_arrays(pa.array(flat), width))
     with atomic_path(path) as temporary:
         pq.write_table(pa.Table.from_arrays(arrays, schema=schema(cells)), temporary, compression="zstd")
     return rows
+
+
+def _exact(path: Path, name: str, values: np.ndarray) -> np.ndarray:
+    """A column in the type it is stored in, no value of it changed."""
+    kind = np.dtype(np.uint8 if name in _VIEWS else np.int16 if name in _POSES else _SCALARS[name])
+    if values.dtype.kind not in "biuf":
+        raise UserError(f"{path}: not written, column {name} holds {values.dtype.name} values, no numbers")
+    if kind.kind == "f":
+        stored, same = values.astype(kind), np.isfinite(values)
+    else:
+        with np.errstate(invalid="ignore"):
+            stored = values.astype(kind)
+        same = stored == values
+    low, high = _RANGES.get(name, (None, None))
+    if low is not None:
+        same = same & (values >= low) & (values <= high)
+    if not same.all():
+        limits = f"{low}..{high}" if low is not None else "numbers that are finite" if kind.kind == "f" else kind.name
+        raise UserError(f"{path}: not written, column {name} holds {values[~same][0]}, which is none of {limits}")
+    return np.ascontiguousarray(stored)
 
 
 def count_rows(path: Path) -> int | None:
@@ -217,8 +248,8 @@ def count_rows(path: Path) -> int | None:
 _RANGES: dict[str, tuple[int, int]] = {
     **dict.fromkeys(_VIEWS, (0, len(CELL_KINDS) - 1)),
     **dict.fromkeys(("configuration", "next_configuration"), (0, (1 << 15) - 1)),
-    "action": (0, 63),
-    "person_action": (-1, 63),
+    "action": (0, MOST_ACTIONS - 1),
+    "person_action": (-1, MOST_ACTIONS - 1),
     "outcome": (0, len(OUTCOMES) - 1),
 }
 

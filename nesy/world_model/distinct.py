@@ -10,16 +10,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from domains.core import Domain, DomainError
-from nesy.log.experience import Experience
+from domains.core import CELL_KINDS, Domain, DomainError, Weighting
+from nesy.checked_arrays import integers
+from nesy.errors import UserError
+from nesy.log.experience import MOST_ACTIONS, Experience
 
 
 @dataclass(frozen=True)
 class Transitions:
     """Distinct views and the distinct transitions between them.
 
-    A transition's weight is the number of (map, view) places it was met in, not of visits: the model of the
-    world should not depend on where the behaviour that collected the experience liked to go.
+    A transition's weight is how often it was met. Weighting by `maps` it is the number of maps it was met on: chances
+    are lost, but the model does not depend on where the behaviour that collected the experience liked to go.
     """
 
     views: np.ndarray
@@ -34,6 +36,8 @@ class Transitions:
     """int64 [E]: index of the view after."""
     weight: np.ndarray
     """int64 [E], positive."""
+    num_actions: int
+    """A."""
 
     def __len__(self) -> int:
         return len(self.action)
@@ -52,8 +56,16 @@ def view_keys(views: np.ndarray) -> np.ndarray:
 
     Returns:
         [n]: int64 of two bits per cell for up to 31 cells, fixed-width bytes beyond.
+
+    Raises:
+        UserError: views that are not square, or other kinds of cells.
     """
-    flat = np.ascontiguousarray(views, dtype=np.uint8).reshape(len(views), -1)
+    views = np.asarray(views)
+    if views.ndim != 3 or views.shape[1] != views.shape[2]:
+        raise UserError(f"views must be square, [n, v, v], found {list(views.shape)}")
+    kinds = f"cells of views (kinds {', '.join(CELL_KINDS)})"
+    flat = integers(views, kinds, (None, None, None), len(CELL_KINDS)).astype(np.uint8, copy=False)
+    flat = np.ascontiguousarray(flat).reshape(len(views), -1)
     cells = flat.shape[1]
     if cells > 31:
         return (flat + 1).view(f"S{cells}").reshape(-1)  # fixed-width strings end at a zero byte, hence + 1
@@ -82,7 +94,12 @@ def free_ahead(configurations: np.ndarray, view_size: int) -> np.ndarray:
 
 
 def transitions_of(
-    experience: Experience, *, base: Transitions | None = None, views: np.ndarray | None = None
+    experience: Experience,
+    *,
+    base: Transitions | None = None,
+    views: np.ndarray | None = None,
+    weighting: Weighting = "visits",
+    num_actions: int | None = None,
 ) -> Transitions:
     """The distinct views of `experience`, and its distinct unobstructed transitions.
 
@@ -90,6 +107,11 @@ def transitions_of(
         experience: any rows.
         base: index views as this set does; it must hold every view of `experience`.
         views: uint8 [m, v, v], further views to index although nothing was met there.
+        weighting: what a transition counts as.
+        num_actions: A; by default the largest action met, plus one.
+
+    Raises:
+        UserError: views or actions outside what can be counted.
     """
     further = experience.view[:0] if views is None else views
     keys = view_keys(np.concatenate([experience.view, experience.next_view, further]))
@@ -103,47 +125,26 @@ def transitions_of(
         assert (unique[np.minimum(index, len(unique) - 1)] == keys).all(), "a view outside the base set"
     visits = np.bincount(index[: 2 * count], minlength=len(unique))
     free = unobstructed(experience)
-    edge = (index[:count] * 4 + experience.action) * len(unique) + index[count : 2 * count]
-    _, place = np.unique(experience.map_id, return_inverse=True)
-    # One entry per (map, transition), then one per transition with the number of maps as its weight.
-    per_map = np.unique(edge[free] * (int(place.max(initial=0)) + 1) + place[free])
-    edges, weight = np.unique(per_map // (int(place.max(initial=0)) + 1), return_counts=True)
-    return from_edges(distinct, visits, edges, weight)
-
-
-def with_mirror(transitions: Transitions, views: np.ndarray | None = None) -> Transitions:
-    """The transitions and their mirror images: left and right change places in views and actions.
-
-    The world has no handedness: the mirror image of a map is a map as likely, so every step met stands for two.
-
-    Args:
-        transitions: any.
-        views: uint8 [m, v, v], distinct, the views to index; they must hold all views and their mirror images. By
-            default those of `transitions` with their mirror images.
-    """
-    t = transitions
-    mirrored = t.views[:, ::-1]
-    keys = view_keys(np.concatenate([t.views, mirrored]))
-    if views is None:
-        unique, first = np.unique(keys, return_index=True)
-        views = np.concatenate([t.views, mirrored])[first]
+    action, total = checked_actions(experience.action, num_actions)
+    edge = (index[:count] * total + action) * len(unique) + index[count : 2 * count]
+    if weighting == "maps":
+        _, place = np.unique(experience.map_id, return_inverse=True)
+        maps = int(place.max(initial=0)) + 1
+        edge = np.unique(edge[free] * maps + place[free]) // maps  # one entry per transition and map
     else:
-        unique = view_keys(views)
-    index = np.searchsorted(unique, keys)
-    assert (unique[np.minimum(index, len(unique) - 1)] == keys).all(), "a view outside the given ones"
-    total = t.num_views
-    same, other = index[:total], index[total:]
-    action = np.array([1, 0, 2, 3])[t.action]
-    edge = np.concatenate(
-        [
-            (same[t.source] * 4 + t.action) * len(unique) + same[t.target],
-            (other[t.source] * 4 + action) * len(unique) + other[t.target],
-        ]
-    )
-    edges, place = np.unique(edge, return_inverse=True)
-    weight = np.bincount(place, np.tile(t.weight, 2)).astype(np.int64)
-    visits = np.bincount(index, np.tile(t.visits, 2), minlength=len(unique)).astype(np.int64)
-    return from_edges(views, visits, edges, weight)
+        edge = edge[free]
+    edges, weight = np.unique(edge, return_counts=True)
+    return from_edges(distinct, visits, edges, weight, total)
+
+
+def checked_actions(actions: np.ndarray, num_actions: int | None) -> tuple[np.ndarray, int]:
+    """Actions as int64 [n], and how many there are: as many as given, or the largest met plus one.
+
+    Raises:
+        UserError: an action is none of those that there are.
+    """
+    found = integers(actions, "actions", (None,), num_actions or MOST_ACTIONS).astype(np.int64)
+    return found, num_actions or int(found.max(initial=0)) + 1
 
 
 def reference_transitions(domain: Domain, variant: str, task: str = "following") -> Transitions | None:
@@ -156,20 +157,24 @@ def reference_transitions(domain: Domain, variant: str, task: str = "following")
     except DomainError:
         return None
     unique, first, index = np.unique(view_keys(np.concatenate([before, after])), return_index=True, return_inverse=True)
-    edge = (index[: len(before)] * 4 + action) * len(unique) + index[len(before) :]
+    action, total = checked_actions(action, len(domain.spec.action_names))
+    edge = (index[: len(before)] * total + action) * len(unique) + index[len(before) :]
     edges, weight = np.unique(edge, return_counts=True)
     distinct = np.concatenate([before, after])[first]
-    return from_edges(distinct, np.bincount(index, minlength=len(unique)), edges, weight)
+    return from_edges(distinct, np.bincount(index, minlength=len(unique)), edges, weight, total)
 
 
-def from_edges(views: np.ndarray, visits: np.ndarray, edges: np.ndarray, weight: np.ndarray) -> Transitions:
-    """Transitions from their numbers `(source * 4 + action) * V + target`, int64 [E] ascending, and weights [E]."""
+def from_edges(
+    views: np.ndarray, visits: np.ndarray, edges: np.ndarray, weight: np.ndarray, num_actions: int
+) -> Transitions:
+    """Transitions from their numbers `(source * A + action) * V + target`, int64 [E] ascending, and weights [E]."""
     total = len(views)
     return Transitions(
         views=np.ascontiguousarray(views),
         visits=visits.astype(np.int64),
-        source=edges // total // 4,
-        action=edges // total % 4,
+        source=edges // total // num_actions,
+        action=edges // total % num_actions,
         target=edges % total,
         weight=weight.astype(np.int64),
+        num_actions=num_actions,
     )

@@ -2,7 +2,7 @@
 
 Views    uint8 [B, v, v] of cell kinds 0 to 3
 Code     N = 8 factors with K = 8 values; belief [B, N, K], rows sum to 1
-Action   a in 0 .. 3
+Action   a in 0 .. A - 1
 
 encode: view -> belief logits;  decode: belief -> cell logits;  transition: belief, action -> next belief;
 infer_action: belief, next belief -> action logits.

@@ -47,9 +47,9 @@ class Counts(NamedTuple):
     """Weighted counts of the families."""
 
     cells: np.ndarray
-    """int32 [F, K ** (P + 1)]: of parents and child."""
+    """int32 [F, K ** (P + 1)]: of parents and child; int64 where the weights add up to more."""
     rows: np.ndarray
-    """int32 [F, K ** P]: of parents."""
+    """[F, K ** P] of that type: of parents."""
     logs: np.ndarray
     """float64 [L]: n log n for n < L."""
 
@@ -78,11 +78,17 @@ def logs_up_to(total: int) -> np.ndarray:
     return counts * np.log(np.maximum(counts, 1.0))
 
 
+def count_type(weight: np.ndarray) -> type[np.generic]:
+    """The narrower of two types that holds the sum of some weights."""
+    return np.int32 if int(weight.sum()) <= np.iinfo(np.int32).max else np.int64
+
+
 def count(codes: np.ndarray, edges: Edges, families: Families, num_values: int, logs: np.ndarray) -> Counts:
     """Count all transitions under codes int64 [V, N]."""
     widest = int(families.size.max())
-    rows = np.zeros((len(families.size), num_values**widest), dtype=np.int32)
-    cells = np.zeros((len(families.size), num_values ** (widest + 1)), dtype=np.int32)
+    kind = count_type(edges.weight)
+    rows = np.zeros((len(families.size), num_values**widest), dtype=kind)
+    cells = np.zeros((len(families.size), num_values ** (widest + 1)), dtype=kind)
     counts = Counts(cells, rows, logs)
     _count(codes, edges, families, counts, num_values)
     return counts

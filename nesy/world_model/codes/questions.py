@@ -18,7 +18,7 @@ import numpy as np
 
 from domains.core import CELL_KINDS
 from nesy.compiled import njit
-from nesy.world_model.codes.counting import Counts, Edges, Families, count, families_of, shift_edge, x_log_x
+from nesy.world_model.codes.counting import Counts, Edges, Families, count, count_type, families_of, shift_edge, x_log_x
 from nesy.world_model.codes.refinement import CodeBook, Refiner
 
 MOST_QUESTIONS = 8
@@ -94,7 +94,7 @@ class _Search(NamedTuple):
     told: np.ndarray
     """bool [N, Q]: whether the factor answers the question."""
     taken: np.ndarray
-    """int32 [K ** N]: weight of the views with a code."""
+    """[K ** N]: weight of the views with a code; see `count_type`."""
 
 
 class GroupSearch:
@@ -166,7 +166,7 @@ class GroupSearch:
             groups.copy(),
             book.codes.copy(),
             np.zeros((num_factors, answers.shape[1]), dtype=np.bool_),
-            np.zeros(refiner.num_values**num_factors, dtype=np.int32),
+            np.zeros(self.refiner.num_values**num_factors, dtype=count_type(self._mass)),
         )
         for i in range(num_factors):
             _answered(answers, search.codes[:, i], refiner.num_values, search.told[i])

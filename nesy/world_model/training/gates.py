@@ -31,7 +31,7 @@ def limits(transitions: Transitions) -> dict[str, float]:
         view), and `inverse_accuracy` (of the likeliest action given both views).
     """
     t, weight = transitions, transitions.weight.astype(np.float64)
-    context = t.source * 4 + t.action
+    context = t.source * t.num_actions + t.action
     order = np.lexsort((-weight, context))
     contexts, first = np.unique(context[order], return_index=True)
     place = np.searchsorted(contexts, context)
@@ -82,8 +82,8 @@ def next_gates(codec: SymbolicCodec, transitions: Transitions) -> dict[str, floa
     """
     t, weight = transitions, transitions.weight.astype(np.float64)
     codes = codec.codes(t.views)
-    context, place = np.unique(t.source * 4 + t.action, return_inverse=True)
-    before, action = codes[context // 4], context % 4
+    context, place = np.unique(t.source * t.num_actions + t.action, return_inverse=True)
+    before, action = codes[context // t.num_actions], context % t.num_actions
     if isinstance(codec.model, SymbolicWorldModel):
         packed = codec.packed()
         assert packed is not None

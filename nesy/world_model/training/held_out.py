@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from domains.core import Weighting
 from nesy.world_model.codec import SymbolicCodec
 from nesy.world_model.codes.refinement import CodeBook
 from nesy.world_model.columns import Columns
@@ -32,7 +33,9 @@ class Guide(Protocol):
 class HeldOut:
     """What was met on the maps that nothing is learned from."""
 
-    def __init__(self, columns: Columns, maps: np.ndarray, training: Transitions, seed: int) -> None:
+    def __init__(
+        self, columns: Columns, maps: np.ndarray, training: Transitions, seed: int, weighting: Weighting = "visits"
+    ) -> None:
         """Gather it.
 
         Args:
@@ -40,9 +43,10 @@ class HeldOut:
             maps: bool [M], which maps are held out.
             training: what is learned from: tells which views are new.
             seed: of where imagined walks begin.
+            weighting: what a transition counts as.
         """
         self.columns, self.maps, self.training, self.seed = columns, maps, training, seed
-        self.transitions = columns.transitions(maps)
+        self.transitions = columns.transitions(maps, weighting=weighting)
         keys = view_keys(self.transitions.views)
         self.new = ~np.isin(keys, view_keys(training.views[training.visits > 0]))
         self._place = np.searchsorted(view_keys(training.views), keys)
@@ -66,8 +70,8 @@ class HeldOut:
             before, then = (torch.as_tensor(codec.certain(codes[ends]), device=device) for ends in (t.source, t.target))
             logits = guide(before, torch.as_tensor(t.action, device=device), then)
             nll = -(F.log_softmax(logits, -1) * then).sum((1, 2)).double().cpu().numpy()
-        context, place = np.unique(t.source * 4 + t.action, return_inverse=True)
-        predicted = _likeliest(codec, guide, codes[context // 4], context % 4)
+        context, place = np.unique(t.source * t.num_actions + t.action, return_inverse=True)
+        predicted = _likeliest(codec, guide, codes[context // t.num_actions], context % t.num_actions)
         same = (codec.views(predicted)[place] == t.views[t.target]).reshape(len(t), -1)
         inferred = infer_actions(codec, codes[t.source], codes[t.target])
         total = weight.sum()

@@ -11,13 +11,14 @@ import hashlib
 import json
 import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from domains.core import Domain
+from domains.core import Domain, Symmetry, Weighting, symmetries_of
 from nesy.config import TrainConfig
 from nesy.errors import UserError
 from nesy.log.experience import Experience
@@ -26,7 +27,14 @@ from nesy.run_folder import write_json
 from nesy.world_model.codec import SymbolicCodec
 from nesy.world_model.codes.readability import readability
 from nesy.world_model.columns import Columns
-from nesy.world_model.distinct import Transitions, reference_transitions, with_mirror
+from nesy.world_model.distinct import Transitions, reference_transitions
+from nesy.world_model.training.gates import evaluate
+from nesy.world_model.training.held_out import HeldOut
+from nesy.world_model.images import with_images
+from nesy.world_model.training.imagination import imagined_rollouts
+from nesy.world_model.training.logs import MetricsLog
+from nesy.world_model.training.paper_training import PaperTrainer
+from nesy.world_model.codes.readability import readability
 from nesy.world_model.storage import load_tensors, save_tensors, save_world_model
 from nesy.world_model.training.gates import evaluate
 from nesy.world_model.training.held_out import HeldOut
@@ -50,6 +58,7 @@ def train(
     *,
     domain: Domain | None = None,
     variant: str = "paper",
+    symmetries: Sequence[Symmetry] | None = None,
 ) -> dict[str, Any]:
     """Train a world model, or go on where an interrupted training stopped.
 
@@ -61,8 +70,10 @@ def train(
         progress: where to report.
         domain: where the experience is from. If its maps can be listed, all their views are encoded and rebuilt,
             also those that no episode shows (rooms behind the goal), and the gates are computed on all maps, poses
-            and actions alike; without it, on what was experienced.
+            and actions alike; without it, on what was experienced. It also says how many actions there are, and what
+            `config` leaves to the world.
         variant: of the domain.
+        symmetries: of the world; those that the domain declares by default.
 
     Returns:
         The gates with the limits of the data beside them (see `gates.evaluate`): views of all kinds, transitions
@@ -72,9 +83,15 @@ def train(
         `architecture`.
 
     Raises:
-        UserError: impossible settings, or no experience.
+        UserError: impossible settings, no experience, or some that cannot be learned from: views that are not square,
+            other kinds of cells, actions that the domain lacks.
     """
     folder = Path(folder)
+    symmetries = symmetries_of(domain) if symmetries is None else tuple(symmetries)
+    name = "this experience" if domain is None else domain.spec.name
+    weighting: Weighting = "visits" if domain is None else domain.spec.weighting
+    config = config.in_world(name, weighting, bool(symmetries))
+    num_actions = None if domain is None else len(domain.spec.action_names)
     _check(config)
     threads, exact = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
     torch.set_num_threads(1)  # small networks: one thread is as fast, and sums are in the same order everywhere
@@ -82,8 +99,11 @@ def train(
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # or matrix products may differ from run to run
         torch.use_deterministic_algorithms(True)
     try:
-        columns = Columns.of(experience) if isinstance(experience, Experience) else Columns.mapped(experience, folder)
-        return _train(columns, config, folder, seed, progress, domain, variant)
+        if isinstance(experience, Experience):
+            columns = Columns.of(experience, num_actions)
+        else:
+            columns = Columns.mapped(experience, folder, num_actions)
+        return _train(columns, config, folder, seed, progress, domain, variant, symmetries)
     finally:
         torch.set_num_threads(threads)
         torch.use_deterministic_algorithms(exact)
@@ -97,25 +117,27 @@ def _train(
     progress: Progress,
     domain: Domain | None,
     variant: str,
+    symmetries: tuple[Symmetry, ...],
 ) -> dict[str, Any]:
+    assert config.weighting is not None
     references = {} if domain is None else _references(domain, variant)
     known = [reference.views for reference in references.values()]
-    everything = columns.transitions(views=np.concatenate(known) if known else None)
+    everything = columns.transitions(views=np.concatenate(known) if known else None, weighting=config.weighting)
     if config.mirror_images:
-        everything = with_mirror(everything)
+        everything = with_images(everything, symmetries)
     apart = columns.held_out(config.held_out, np.random.default_rng(seed))
     reference = references.get("crossing", everything)
     trainer: Trainer
     if config.architecture == "paper":
-        held_out = columns.transitions(apart) if apart.any() else None
+        held_out = columns.transitions(apart, weighting=config.weighting) if apart.any() else None
         trainer = PaperTrainer(config, seed, everything, columns, apart, held_out, reference)
     else:
         training = everything
         if apart.any():
-            training = columns.transitions(~apart, views=everything.views)
+            training = columns.transitions(~apart, everything.views, config.weighting)
             if config.mirror_images:
-                training = with_mirror(training, views=everything.views)
-        kept = HeldOut(columns, apart, training, seed) if apart.any() else None
+                training = with_images(training, symmetries, views=everything.views)
+        kept = HeldOut(columns, apart, training, seed, config.weighting) if apart.any() else None
         predicates = domain.predicates if domain is not None else None
         trainer = SymbolicTrainer(config, seed, everything, training, kept, predicates, reference)
     fingerprint = _fingerprint(config, seed, everything)
@@ -170,7 +192,12 @@ def _check(config: TrainConfig) -> None:
 
 def _fingerprint(config: TrainConfig, seed: int, transitions: Transitions) -> str:
     """What a checkpoint must agree in to be gone on from; the time limit may change."""
-    settings = {**dataclasses.asdict(config), "time_limit": 0.0, "seed": seed}
+    settings = {
+        **dataclasses.asdict(config),
+        "time_limit": 0.0,
+        "seed": seed,
+        "num_actions": transitions.num_actions,
+    }
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     for array in (transitions.views, transitions.source, transitions.action, transitions.target, transitions.weight):
         digest.update(np.ascontiguousarray(array).tobytes())

@@ -60,7 +60,7 @@ class PaperTrainer:
         self.generator = torch.Generator().manual_seed(seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            self.model = PaperWorldModel(view_size=everything.views.shape[1])
+            self.model = PaperWorldModel(view_size=everything.views.shape[1], num_actions=everything.num_actions)
         self.model.to(self.device)
         learned = columns.transitions(~apart)
         self.weights = losses.class_weights(learned.views, learned.visits).to(self.device)

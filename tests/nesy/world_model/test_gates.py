@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nesy.world_model import SymbolicCodec
-from nesy.world_model.distinct import Transitions, transitions_of, unobstructed, view_keys, with_mirror
+from nesy.world_model.distinct import Transitions, transitions_of, unobstructed, view_keys
 from nesy.world_model.training.gates import evaluate, limits, view_gates
 
 
@@ -13,7 +13,7 @@ def test_limits_by_hand() -> None:
     views[1, 0, 0], views[2, 0, :2] = 1, 1
     transitions = Transitions(
         views=views, visits=np.ones(3, int), source=np.array([0, 0, 1]), action=np.array([2, 2, 2]),
-        target=np.array([1, 2, 1]), weight=np.array([3, 1, 4]),
+        target=np.array([1, 2, 1]), weight=np.array([3, 1, 4]), num_actions=3,
     )  # fmt: skip
     found = limits(transitions)
     entropy = -(3 * np.log(3 / 4) + np.log(1 / 4)) / 8
@@ -31,8 +31,19 @@ def test_view_keys_tell_views_apart() -> None:
     assert len(np.unique(view_keys(wide))) == 150
 
 
-def test_transitions_count_maps_not_visits(toy) -> None:  # type: ignore[no-untyped-def]
+def test_transitions_count_visits(toy) -> None:  # type: ignore[no-untyped-def]
     transitions = transitions_of(toy)
+    assert transitions.weight.sum() == len(toy) and transitions.visits.sum() == 2 * len(toy)
+    keys = view_keys(transitions.views)
+    met: dict[tuple[int, int, int], int] = {}
+    for row in zip(view_keys(toy.view), toy.action, view_keys(toy.next_view), strict=True):
+        met[row] = met.get(row, 0) + 1
+    edges = zip(keys[transitions.source], transitions.action, keys[transitions.target], strict=True)
+    assert dict(zip(edges, transitions.weight.tolist(), strict=True)) == met
+
+
+def test_transitions_count_maps_where_that_is_asked_for(toy) -> None:  # type: ignore[no-untyped-def]
+    transitions = transitions_of(toy, weighting="maps")
     assert transitions.visits.sum() == 2 * len(toy)
     assert transitions.weight.max() <= len(np.unique(toy.map_id))
     met = set()
@@ -78,21 +89,3 @@ def test_views_that_share_a_code_are_counted(codec: SymbolicCodec, toy) -> None:
     assert figures["views_exact"] == pytest.approx(1 / len(views))
     assert figures["values_used"] == [1] * 8
     assert figures["perplexity"] == pytest.approx([1.0] * 8)
-
-
-def test_mirror_images_are_added_once(toy) -> None:  # type: ignore[no-untyped-def]
-    plain = transitions_of(toy)
-    both = with_mirror(plain)
-    assert both.weight.sum() == 2 * plain.weight.sum()
-    keys = view_keys(both.views)
-    edges = {
-        (int(keys[s]), int(a), int(keys[t])) for s, a, t in zip(both.source, both.action, both.target, strict=True)
-    }
-    mirrored = view_keys(both.views[:, ::-1])
-    swap = [1, 0, 2, 3]
-    assert edges == {
-        (int(mirrored[s]), swap[a], int(mirrored[t]))
-        for s, a, t in zip(both.source, both.action, both.target, strict=True)
-    }
-    again = with_mirror(both)
-    assert len(again) == len(both)

@@ -5,17 +5,16 @@ import pytest
 
 from nesy.world_model.codes.code_search import CodeSearch
 from nesy.world_model.codes.counting import count, edges_of, families_of, logs_up_to
+from nesy.world_model.distinct import transitions_of
 from nesy.world_model.codes.questions import GroupSearch, Questions
 from nesy.world_model.codes.refinement import Refiner
-from nesy.world_model.codes.telling import telling_cost
-from nesy.world_model.distinct import transitions_of, with_mirror
 from nesy.world_model.structure import Limits
 from tests.nesy.conftest import toy_experience
 
 
 @pytest.fixture(scope="module")
 def refiner() -> Refiner:
-    return Refiner(with_mirror(transitions_of(toy_experience())), 8, 4, Limits(now=3, next=2, total=4, penalty=1.0))
+    return Refiner(transitions_of(toy_experience(), weighting="maps"), 8, 4, Limits(now=3, next=2, total=4, penalty=1.0))
 
 
 def test_questions_that_agree_are_asked_once() -> None:
