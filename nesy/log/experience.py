@@ -220,7 +220,7 @@ def _exact(path: Path, name: str, values: np.ndarray) -> np.ndarray:
     if values.dtype.kind not in "biuf":
         raise UserError(f"{path}: not written, column {name} holds {values.dtype.name} values, no numbers")
     if kind.kind == "f":
-        stored, same = values.astype(kind), np.isfinite(values)
+        stored, same = values.astype(kind), np.isfinite(values) | (name != "reward")  # a distance may be unknown
     else:
         with np.errstate(invalid="ignore"):
             stored = values.astype(kind)

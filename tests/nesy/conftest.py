@@ -7,10 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from domains.core import Symmetry
 from nesy.config import TrainConfig
 from nesy.log.experience import Experience
 from nesy.world_model import SymbolicCodec, load_world_model, train
 
+SYMMETRIES = (Symmetry("mirror image", (1, 0, 2, 3), lambda views: views[:, ::-1]),)
+"""Of the toy world."""
 SMALL = TrainConfig(epochs=6, batch_size=64, held_out=0.25, time_limit=0.0)
 
 
@@ -71,7 +74,7 @@ def toy() -> Experience:
 def trained(tmp_path_factory: pytest.TempPathFactory, toy: Experience) -> Path:
     """Folder of a model trained on the toy world."""
     folder = tmp_path_factory.mktemp("toy") / "world_model"
-    train(toy, SMALL, folder, seed=1)
+    train(toy, SMALL, folder, seed=1, symmetries=SYMMETRIES)
     return folder
 
 

@@ -86,3 +86,78 @@ def test_room_on_the_disk_is_reserved(tmp_path: Path, monkeypatch: pytest.Monkey
     array = module._nameless(tmp_path, 100_000, np.int64)
     assert array.shape == (100_000,)
     assert opened[0].st_blocks * 512 >= array.nbytes == opened[0].st_size
+
+
+# ------------------------------------------------------------------ what is refused, and what is not taken for other
+def test_more_actions_than_four_are_told_apart(toy: Experience, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against plain counting: an action was once taken modulo 4 and its view for another."""
+    import dataclasses
+
+    monkeypatch.setattr(module, "CHUNK", 333)
+    rng = np.random.default_rng(0)
+    action = rng.integers(0, 7, len(toy))
+    experience = dataclasses.replace(toy, action=action)
+    expected: dict[tuple[bytes, int, bytes], int] = {}
+    maps: dict[tuple[bytes, int, bytes], set[int]] = {}
+    for view, a, then, place in zip(toy.view, action, toy.next_view, toy.map_id, strict=True):
+        key = (view.tobytes(), int(a), then.tobytes())
+        expected[key] = expected.get(key, 0) + 1
+        maps.setdefault(key, set()).add(int(place))
+    for weighting in ("visits", "maps"):
+        for t in (
+            Columns.of(experience).transitions(weighting=weighting),
+            transitions_of(experience, weighting=weighting),
+            Columns.of(experience, 9).transitions(weighting=weighting),
+        ):
+            assert t.num_actions in (7, 9)
+            found = {
+                (t.views[s].tobytes(), int(a), t.views[then].tobytes()): int(w)
+                for s, a, then, w in zip(t.source, t.action, t.target, t.weight, strict=True)
+            }
+            assert found == (expected if weighting == "visits" else {key: len(met) for key, met in maps.items()})
+
+
+@pytest.mark.parametrize(
+    ("changes", "num_actions", "message"),
+    [
+        ({"action": lambda a: a + 1}, 4, r"actions are whole numbers in 0\.\.3, found 4"),
+        ({"action": lambda a: a - 1}, None, "actions .* found -1"),
+        ({"action": lambda a: a + 100}, None, r"actions are whole numbers in 0\.\.63"),
+        ({"action": lambda a: a / 2}, None, r"actions .* found .\.5"),
+        ({"action": lambda a: a[:5]}, None, "differ in length"),
+        ({"view": lambda v: v + 3}, None, r"cells of views .* in 0\.\.3, found 4"),
+        ({"next_view": lambda v: v.astype(int) - 1}, None, "cells of views .* found -1"),
+        ({"next_view": lambda v: v.astype(int) + 256}, None, "cells of views"),
+        ({"view": lambda v: v[:, :4], "next_view": lambda v: v[:, :4]}, None, "views must be square"),
+    ],
+)
+def test_what_cannot_be_learned_from_is_refused(
+    toy: Experience, changes: dict[str, Any], num_actions: int | None, message: str
+) -> None:
+    import dataclasses
+
+    changed = {name: change(getattr(toy, name)) for name, change in changes.items()}
+    with pytest.raises(UserError, match=message):
+        Columns.of(dataclasses.replace(toy, **changed), num_actions)
+
+
+def test_episodes_are_told_apart_whatever_their_numbers(toy: Experience) -> None:
+    import dataclasses
+
+    episode = np.arange(len(toy)) * (1 << 32)
+    assert len(np.unique(Columns.of(dataclasses.replace(toy, episode=episode)).episode)) == len(toy)
+
+
+@pytest.mark.parametrize("size", [3, 5, 7])
+def test_equal_keys_are_equal_views(size: int) -> None:
+    from nesy.world_model.distinct import view_keys
+
+    views = np.random.default_rng(size).integers(0, 4, (200, size, size))
+    views[100:] = views[:100]
+    views[150:, 0, 0] = (views[150:, 0, 0] + 1) % 4
+    keys = view_keys(views)
+    same = (views[:, None] == views[None]).all((2, 3))
+    np.testing.assert_array_equal(keys[:, None] == keys[None], same)
+    for wrong in (views + 1, views - 1, views[:, :-1], views / 2, views[0]):
+        with pytest.raises(UserError):
+            view_keys(wrong)

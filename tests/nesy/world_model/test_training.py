@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,15 @@ import numpy as np
 import pytest
 import torch
 
+from domains.core import DomainError, DomainSpec, load_domain
 from nesy.config import TrainConfig
+from nesy.dbn.extraction import extract
 from nesy.errors import UserError
+from nesy.experience import COLUMNS, Experience
 from nesy.progress import SilentProgress, Task
 from nesy.world_model import SymbolicCodec, load_world_model, save_world_model, train
 from nesy.world_model.storage import load_tensors
-from tests.nesy.conftest import SMALL, toy_experience
+from tests.nesy.conftest import SMALL, SYMMETRIES, toy_experience
 
 
 class Killed(Exception):
@@ -62,14 +66,14 @@ def test_resume_gives_the_same_weights_bit_for_bit(
     whole = trained
     if architecture == "paper":
         whole = tmp_path / "whole"
-        train(experience, config, whole, seed=1)
+        train(experience, config, whole, seed=1, symmetries=SYMMETRIES)
     folder = tmp_path / "cut"
     moments = (1, 2) if architecture == "paper" else (1, 2, 3, 1, 2)
     for epochs in moments:
         with pytest.raises(Killed):
-            train(experience, config, folder, seed=1, progress=KilledAfter(epochs))
+            train(experience, config, folder, seed=1, progress=KilledAfter(epochs), symmetries=SYMMETRIES)
         assert not (folder / "model.safetensors").exists()
-    train(experience, config, folder, seed=1)
+    train(experience, config, folder, seed=1, symmetries=SYMMETRIES)
     expected, got = weights(whole), weights(folder)
     assert expected.keys() == got.keys()
     for name, tensor in expected.items():
@@ -84,9 +88,9 @@ def test_resume_gives_the_same_weights_bit_for_bit(
 def test_killed_by_the_signal_and_resumed(tmp_path: Path, trained: Path) -> None:
     code = (
         "import sys; sys.path.insert(0, sys.argv[2]); from pathlib import Path\n"
-        "from tests.nesy.conftest import SMALL, toy_experience\n"
+        "from tests.nesy.conftest import SMALL, SYMMETRIES, toy_experience\n"
         "from nesy.world_model import train\n"
-        "train(toy_experience(), SMALL, Path(sys.argv[1]), seed=1)\n"
+        "train(toy_experience(), SMALL, Path(sys.argv[1]), seed=1, symmetries=SYMMETRIES)\n"
     )
     folder = tmp_path / "killed"
     root = str(Path(__file__).parents[3])
@@ -99,7 +103,7 @@ def test_killed_by_the_signal_and_resumed(tmp_path: Path, trained: Path) -> None
         time.sleep(0.01)
     process.kill()
     process.wait()
-    train(toy_experience(), SMALL, folder, seed=1)
+    train(toy_experience(), SMALL, folder, seed=1, symmetries=SYMMETRIES)
     expected, got = weights(trained), weights(folder)
     assert all(torch.equal(expected[name], got[name]) for name in expected)
 
@@ -226,3 +230,91 @@ def test_impossible_settings(settings: dict[str, object], message: str, tmp_path
         train(toy, TrainConfig(**settings), tmp_path)  # type: ignore[arg-type]
     with pytest.raises(UserError, match="no experience"):
         train(toy.select(np.zeros(len(toy), bool)), SMALL, tmp_path)
+
+
+# ------------------------------------------------------------------ what steps count as, actions, symmetries
+def slippery(actions: int, steps: int = 6000) -> Experience:
+    """Three views in a ring on one map: one on with 0.9, two on with 0.1; the last action stays."""
+    rng = np.random.default_rng(0)
+    views = np.zeros((3, 3, 3), np.uint8)
+    views[1, 0, 0], views[2, 0, 0] = 1, 2
+    before, action = rng.integers(0, 3, steps), rng.integers(0, actions, steps)
+    then = np.where(action == actions - 1, before, (before + 1 + (rng.random(steps) < 0.1)) % 3)
+    columns: dict[str, Any] = {name: np.zeros(steps, np.int64) for name in COLUMNS}
+    poses = np.zeros((steps, 3), np.int16)
+    columns |= {
+        "episode": np.arange(steps), "source": np.full(steps, "crossing-random"), "action": action,
+        "view": views[before], "next_view": views[then], "person_view": views[before],
+        "next_person_view": views[then], "relative_pose": poses, "next_relative_pose": poses,
+    }  # fmt: skip
+    return Experience(**columns)
+
+
+QUICK = TrainConfig(epochs=6, searches=1, held_out=0.0, time_limit=0.0)
+
+
+@pytest.mark.parametrize("actions", [2, 6])
+def test_chances_are_those_of_the_visits(actions: int, tmp_path: Path) -> None:
+    """On one map a weight by maps makes 0.9 and 0.1 the same; and actions from 4 on once were those of other views."""
+    experience = slippery(actions)
+    train(experience, QUICK, tmp_path / "visits")
+    train(experience, replace(QUICK, weighting="maps"), tmp_path / "maps")
+    views = np.unique(experience.view, axis=0)
+    before, then = ((part[:, None] == views).all((2, 3)).argmax(1) for part in (experience.view, experience.next_view))
+    counts = np.zeros((3, actions, 3))
+    np.add.at(counts, (before, experience.action, then), 1)
+    for name, mass in (("visits", counts), ("maps", counts > 0)):
+        model = load_world_model(tmp_path / name)
+        assert model.num_actions == actions
+        codec = SymbolicCodec(model)
+        dbn = extract(model, codec.codes(experience.view), experience.action, codec.codes(experience.next_view))
+        codes = codec.codes(views)
+        for a in range(actions):
+            chances = np.exp(dbn.log_prob(codes[:, None], a, codes[None]))
+            np.testing.assert_allclose(chances, mass[:, a] / mass[:, a].sum(1, keepdims=True), atol=0.02)
+
+
+class _Domain:
+    """Enough of a domain for a training: no map can be listed, no symmetry is declared."""
+
+    predicates = load_domain().predicates
+    spec = DomainSpec(name="elsewhere", variants=("only",), action_names=("north", "south", "east"))
+
+    def transitions(self, *_: object, **__: object) -> None:
+        raise DomainError("too many maps")
+
+
+def test_a_training_knows_the_actions_of_its_domain(tmp_path: Path, toy) -> None:  # type: ignore[no-untyped-def]
+    three = toy.select(toy.action < 2)  # the third action was never taken
+    train(three, QUICK, tmp_path, domain=_Domain())  # type: ignore[arg-type]
+    assert load_world_model(tmp_path).num_actions == 3
+    with pytest.raises(UserError, match=r"actions are whole numbers in 0\.\.2, found 3"):
+        train(toy, QUICK, tmp_path / "other", domain=_Domain())  # type: ignore[arg-type]
+
+
+def test_mirror_images_only_where_a_symmetry_is_declared(tmp_path: Path, toy) -> None:  # type: ignore[no-untyped-def]
+    asked = replace(QUICK, mirror_images=True)
+    with pytest.raises(UserError, match="this experience declares no symmetry"):
+        train(toy, asked, tmp_path)
+    with pytest.raises(UserError, match="elsewhere declares no symmetry"):
+        train(toy, asked, tmp_path, domain=_Domain())  # type: ignore[arg-type]
+    assert not (tmp_path / "metrics.jsonl").exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "weighting", "symmetric", "expected"),
+    [
+        ({}, "visits", False, ("visits", False)),
+        ({}, "maps", True, ("maps", True)),
+        ({"weighting": "visits", "mirror_images": False}, "maps", True, ("visits", False)),
+        ({"weighting": "maps"}, "visits", False, ("maps", False)),
+    ],
+)
+def test_what_is_not_set_is_as_the_world_declares(
+    given: dict[str, Any], weighting: Any, symmetric: bool, expected: tuple[str, bool]
+) -> None:
+    config = TrainConfig(**given).in_world("w", weighting, symmetric)
+    assert (config.weighting, config.mirror_images) == expected
+    assert config.in_world("other", "visits", True) == config
+    with pytest.raises(UserError, match="weighting must be visits or maps"):
+        TrainConfig(weighting="steps")  # type: ignore[arg-type]
