@@ -52,7 +52,8 @@ class CommonArguments:
     run: Path = Path("runs/default")
     """The run folder."""
     preset: PresetName | None = None
-    """Settings to start from: smoke, quick or paper (default: those of the run, or quick for a new one)."""
+    """Settings to start from: smoke, quick or paper (default: those of the run, or quick for a new one). Domain,
+    variant and seed stay those of the run."""
     variant: str | None = None
     """Variant of the task (default: that of the run, or paper)."""
     seed: int | None = None
@@ -68,18 +69,20 @@ class CommonArguments:
 def base_config(arguments: list[str]) -> RunConfig:
     """The configuration that the options on the command line then change.
 
-    That is the run's own, or the preset's when one is named or the run is new; with another variant, that is what is
-    compared. It has to be known before the other options are parsed, so that their help shows the values that would
-    really be used.
+    That is the run's own, or the preset's when one is named or the run is new; a preset says how much is done, not in
+    which world: domain, variant and seed of a run that is there stay. With another variant, that is what is compared.
+    It has to be known before the other options are parsed, so that their help shows the values that would really be
+    used.
     """
     run, preset = Path(option(arguments, "--run") or CommonArguments.run), option(arguments, "--preset")
-    if preset in PRESETS:
-        config = PRESETS[preset]
-    elif (run / "config.json").is_file():
-        config = configuration.load(run / "config.json")
+    prepared = configuration.load(run / "config.json") if (run / "config.json").is_file() else None
+    named = PRESETS.get(preset or "")
+    if named is not None and prepared is not None:
+        config, variant = replace(named, domain=prepared.domain, seed=prepared.seed), prepared.variant
     else:
-        config = PRESETS["quick"]
-    variant = option(arguments, "--variant") or config.variant
+        config = named or prepared or PRESETS["quick"]
+        variant = config.variant
+    variant = option(arguments, "--variant") or variant
     if variant == config.variant:
         return config
     return replace(config, variant=variant, compare=replace(config.compare, variants=(variant,)))
@@ -128,8 +131,8 @@ def opened(options: CommonArguments, step: str, **sections: Any) -> Iterator[Pip
         seed=base.seed if options.seed is None else options.seed,
         **sections,
     )
-    pipeline = Pipeline(options.run, config, options.jobs)
     _check_names(config)
+    pipeline = Pipeline(options.run, _in_world(config), options.jobs)
     with pipeline.run.lock():
         pipeline.configure(redo_from=step if options.redo else None)
         yield pipeline
@@ -146,6 +149,15 @@ def _check_names(config: RunConfig) -> None:
     for path in (*config.compare.rules, *config.compare.policies):
         if not Path(path).is_file():
             raise UserError(f"{path}: no such file")
+
+
+def _in_world(config: RunConfig) -> RunConfig:
+    """The configuration with what it leaves to its world; see `TrainConfig.in_world`."""
+    from domains.core import load_domain, symmetries_of
+
+    domain = load_domain(config.domain)
+    train = config.train.in_world(domain.spec.name, domain.spec.weighting, bool(symmetries_of(domain)))
+    return replace(config, train=train)
 
 
 class Pipeline:
@@ -168,7 +180,7 @@ class Pipeline:
         if redo_from is not None:
             self._remove_from(redo_from)
         if self.run.has("config"):
-            self._check_unchanged(configuration.load(self.run.config))
+            self._check_unchanged(_in_world(configuration.load(self.run.config)))
         elif self.run.path.is_dir() and any(not item.name.startswith(".") for item in self.run.path.iterdir()):
             raise UserError(f"{self.run.path}: holds files but no config.json, so it is no run folder; name another")
         if not self.run.has("config"):

@@ -17,7 +17,6 @@ from nesy.config import CollectConfig
 from nesy.log.experience import SOURCES, count_rows, write_part
 from nesy.progress import SILENT, Progress, Task
 
-NUM_ACTIONS = 4
 LEAD = 16
 """An exploring episode begins with fewer than this many steps of the expert, and walks at random from there."""
 SWITCH = 0.2
@@ -156,7 +155,9 @@ def _collect_shard(
         )
     else:
         env = domain.make(task_name, num_envs, variant=variant, seed=start)
-    steps = _Steps(env, shard, _Behaviour(behaviour, task_name, config.following_mixture, num_envs, rng), task)
+    num_actions = len(domain.spec.action_names)
+    acting = _Behaviour(behaviour, task_name, config.following_mixture, num_envs, num_actions, rng)
+    steps = _Steps(env, shard, acting, task)
     return write_part(path, {**steps.columns(), "source": np.full(steps.rows, shard.source)})
 
 
@@ -170,15 +171,17 @@ def _maps(domain: Domain, variant: str, shard: Shard, seed: int) -> np.ndarray:
 class _Behaviour:
     """Chooses actions: at random, as the expert, exploring, or switching between random and expert."""
 
-    def __init__(self, name: str, task: str, mixture: float, num_envs: int, rng: np.random.Generator) -> None:
-        self.name, self.mixture, self.rng = name, mixture, rng
+    def __init__(
+        self, name: str, task: str, mixture: float, num_envs: int, num_actions: int, rng: np.random.Generator
+    ) -> None:
+        self.name, self.mixture, self.num_actions, self.rng = name, mixture, num_actions, rng
         self.expert = "goal" if task == "crossing" else "follower"
         self.acts_randomly = rng.random(num_envs) < mixture
         self.lead = np.zeros(num_envs, dtype=np.int64)
 
     def actions(self, env: BatchedEnvironment, t: np.ndarray) -> np.ndarray:
         """Actions int64 [B] at steps `t` [B] of the episodes."""
-        chosen = self.rng.integers(0, NUM_ACTIONS, env.num_envs)
+        chosen = self.rng.integers(0, self.num_actions, env.num_envs)
         if self.name == "random":
             return chosen
         expert = env.expert_actions(self.expert)

@@ -192,14 +192,18 @@ def write_part(path: Path, columns: Mapping[str, np.ndarray | Sequence[str]]) ->
         raise UserError(f"{path}: not written, columns missing or unknown: {sorted(set(columns) ^ set(COLUMNS))}")
     rows, shape = len(columns["action"]), np.shape(columns["view"])[1:]
     if len(shape) != 2 or shape[0] != shape[1] or not shape[0]:
-        raise UserError(f"{path}: not written, views must be square, [n, v, v], found {list(np.shape(columns['view']))}")
+        raise UserError(
+            f"{path}: not written, views must be square, [n, v, v], found {list(np.shape(columns['view']))}"
+        )
     cells = shape[0] * shape[1]
     arrays = []
     for name in COLUMNS:
         wanted = (rows, *(shape if name in _VIEWS else (3,) if name in _POSES else ()))
         values = np.asarray(columns[name])
         if values.shape != wanted:
-            raise UserError(f"{path}: not written, {name} must have the shape {list(wanted)}, found {list(values.shape)}")
+            raise UserError(
+                f"{path}: not written, {name} must have the shape {list(wanted)}, found {list(values.shape)}"
+            )
         if name == "source":
             unknown = sorted(set(np.unique(values).tolist()) - set(SOURCES))
             if unknown:

@@ -94,9 +94,7 @@ class SymbolicTrainer:
         self.generator = torch.Generator().manual_seed(seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            self.model = SymbolicWorldModel(
-                view_size=everything.views.shape[1], num_actions=everything.num_actions
-            )
+            self.model = SymbolicWorldModel(view_size=everything.views.shape[1], num_actions=everything.num_actions)
             self.guide = ForwardGuide(self.model)
         self.model.to(self.device)
         self.guide.to(self.device)

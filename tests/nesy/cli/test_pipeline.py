@@ -10,6 +10,11 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
+from domains import core
+from domains.core import DomainSpec
+from domains.person_following.domain import PersonFollowing
+from nesy.cli import configuration, pipeline
+from nesy.cli.configuration import PRESETS, RunConfig
 from nesy.cli.main import main
 from nesy.report.text import comparison_rows
 from tests.conftest import TINY
@@ -287,3 +292,61 @@ def test_an_agent_s_choice_is_explained(run: Path, tmp_path: Path, capsys: pytes
         assert main([*question, "--why", agent, "--rules", str(rules)]) == 0
         found = json.loads(capsys.readouterr().out)
         assert found["action"] == "stay" and set(found["because"]) == {"left", "right", "forward"}
+
+
+# ------------------------------------------------------------------ what a prepared run has fixed
+class _Elsewhere(PersonFollowing):
+    """The same task as a domain that declares nothing about how to learn."""
+
+    spec = DomainSpec(name="elsewhere", variants=PersonFollowing.spec.variants)
+    symmetries = property()  # type: ignore[assignment]
+
+
+ELSEWHERE = _Elsewhere()
+
+
+@pytest.fixture
+def prepared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run folder with nothing but a configuration, of another domain, variant and seed than those of the presets."""
+    monkeypatch.setitem(core._REGISTRY, "elsewhere", f"{__name__}:ELSEWHERE")
+    configuration.save(RunConfig(domain="elsewhere", variant="clean", seed=7), tmp_path / "config.json", {})
+    return tmp_path
+
+
+@pytest.mark.parametrize("preset", ["smoke", "quick", "paper"])
+def test_a_preset_keeps_the_world_of_a_prepared_run(preset: str, prepared: Path) -> None:
+    config = pipeline.base_config(["--run", str(prepared), "--preset", preset])
+    assert (config.domain, config.variant, config.seed) == ("elsewhere", "clean", 7)
+    assert config.compare.variants == ("clean",) and config.collect == PRESETS[preset].collect
+    other = pipeline.base_config(["--run", str(prepared), f"--preset={preset}", "--variant", "intent"])
+    assert (other.domain, other.variant, other.compare.variants) == ("elsewhere", "intent", ("intent",))
+    new = pipeline.base_config(["--run", str(prepared / "new"), "--preset", preset])
+    assert new == PRESETS[preset]
+
+
+def test_a_run_goes_on_in_its_world_whatever_the_preset(prepared: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    few = ("--crossing-episodes", "2", "--following-episodes", "2")
+    asked = ("train", "--run", str(prepared), "--preset", "smoke", "--mirror-images")
+    before = (prepared / "config.json").read_bytes()
+    assert main(list(asked)) == 2
+    assert "elsewhere declares no symmetry" in _error(capsys)
+    assert (prepared / "config.json").read_bytes() == before
+    assert main(["collect", "--run", str(prepared), "--preset", "smoke", *few]) == 0
+    config = json.loads((prepared / "config.json").read_text())
+    assert (config["domain"], config["variant"], config["seed"]) == ("elsewhere", "clean", 7)
+    assert (config["train"]["weighting"], config["train"]["mirror_images"]) == ("visits", False)
+    capsys.readouterr()
+    assert main(["collect", "--run", str(prepared), "--preset", "quick", *few, "--variant", "paper"]) == 2
+    assert "variant: clean, now paper" in _error(capsys)
+
+
+def test_a_run_of_person_following_says_what_its_steps_count_as(run: Path, copy: Path) -> None:
+    train = json.loads((run / "config.json").read_text())["train"]
+    assert (train["weighting"], train["mirror_images"]) == ("maps", True)
+    # a run made before there was the setting goes on as it was made
+    config = json.loads((copy / "config.json").read_text())
+    del config["train"]["weighting"]
+    (copy / "config.json").write_text(json.dumps(config))
+    assert main(["train", "--run", str(copy), "--json"]) == 0
+    assert json.loads((copy / "config.json").read_text())["train"]["weighting"] == "maps"
+    assert main(["train", "--run", str(copy), "--weighting", "visits"]) == 2

@@ -1,4 +1,6 @@
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -75,3 +77,24 @@ def test_rows_are_whole_episodes_in_order(tmp_path: Path) -> None:
     explored = e.source == "crossing-explore"
     assert e.view[explored].max() == 2
     assert (e.reward[expert & ended] > 0.8).all()
+
+
+@pytest.mark.parametrize("actions", [("left", "right"), ("left", "right", "forward")])
+def test_only_actions_that_exist_are_drawn(actions: tuple[str, ...], tmp_path: Path) -> None:
+    class FewActions:
+        spec = replace(load_domain().spec, action_names=actions)
+
+        def make(self, *arguments: Any, **keywords: Any) -> Any:
+            env = load_domain().make(*arguments, **keywords)
+            step = env.step
+            env.expert_actions = lambda kind: np.zeros(env.num_envs, np.int64)
+
+            def checked(action: np.ndarray) -> Any:
+                assert action.max() < len(actions), "the world has no such action"
+                return step(action)
+
+            env.step = checked
+            return env
+
+    collect(FewActions(), CollectConfig(crossing_episodes=4, following_episodes=8, num_envs=4), tmp_path, seed=0)  # type: ignore[arg-type]
+    assert sorted(set(Experience.load(tmp_path).action.tolist())) == list(range(len(actions)))

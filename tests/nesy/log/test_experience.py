@@ -1,4 +1,5 @@
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -117,3 +118,39 @@ def test_some_columns_alone_are_those_of_all(tmp_path: Path) -> None:
     np.testing.assert_array_equal(some["view"], everything.view)
     np.testing.assert_array_equal(np.array(SOURCES)[some["source_number"]], everything.source)
     assert len(load_columns(tmp_path, ("action",), ("following-mixture",))["action"]) == 5
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("view", lambda v: v + 4, r"column view holds \d, which is none of 0\.\.3"),
+        ("next_view", lambda v: v.astype(int) - 1, "column next_view holds -1"),
+        ("person_view", lambda v: v + 0.5, "column person_view holds"),
+        ("next_person_view", lambda v: v.astype(int) + 256, "column next_person_view holds"),
+        ("view", lambda v: v[:, :, :4], "views must be square"),
+        ("view", lambda v: v.reshape(len(v), 25), "views must be square"),
+        ("next_view", lambda v: v[:, :3, :3], "next_view must have the shape"),
+        ("action", lambda a: a + 64, r"column action holds \d+, which is none of 0\.\.63"),
+        ("action", lambda a: a + 256, "column action holds"),
+        ("action", lambda a: a - 10, "column action holds -"),
+        ("action", lambda a: np.array(["go"] * len(a)), "column action holds str"),
+        ("action", lambda a: a[:3], "must have the shape"),
+        ("outcome", lambda a: a + 100, "column outcome holds"),
+        ("configuration", lambda a: a + 70_000, "column configuration holds"),
+        ("t", lambda a: a + (1 << 40), "column t holds"),
+        ("reward", lambda r: r * np.nan, "column reward holds nan"),
+        ("terminated", lambda b: b + 2, "column terminated holds"),
+        ("source", lambda s: np.array(["elsewhere"] * len(s)), "unknown source 'elsewhere'"),
+        ("relative_pose", lambda p: p[:, :2], "relative_pose must have the shape"),
+    ],
+)
+def test_what_could_not_be_read_again_is_not_written(name: str, change: Any, message: str, tmp_path: Path) -> None:
+    data = columns(7, np.random.default_rng(0))
+    data["action"] = np.arange(7)
+    path = tmp_path / "part-00000.parquet"
+    with pytest.raises(UserError, match=message):
+        write_part(path, {**data, name: change(data[name])})
+    with pytest.raises(UserError, match="columns missing or unknown"):
+        write_part(path, {**data, "extra": data["t"]})
+    assert not path.exists()
+    assert write_part(path, data) == 7 and len(Experience.load(tmp_path)) == 7

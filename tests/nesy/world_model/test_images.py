@@ -26,7 +26,9 @@ def test_mirror_images_are_added_once(toy) -> None:  # type: ignore[no-untyped-d
     both = with_images(plain, SYMMETRIES)
     assert both.weight.sum() == 2 * plain.weight.sum()
     keys, mirrored = view_keys(both.views), view_keys(both.views[:, ::-1])
-    edges = {(int(keys[s]), int(a), int(keys[t])) for s, a, t in zip(both.source, both.action, both.target, strict=True)}
+    edges = {
+        (int(keys[s]), int(a), int(keys[t])) for s, a, t in zip(both.source, both.action, both.target, strict=True)
+    }
     swap = [1, 0, 2, 3]
     assert edges == {
         (int(mirrored[s]), swap[a], int(mirrored[t]))

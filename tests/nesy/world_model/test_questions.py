@@ -14,7 +14,9 @@ from tests.nesy.conftest import toy_experience
 
 @pytest.fixture(scope="module")
 def refiner() -> Refiner:
-    return Refiner(transitions_of(toy_experience(), weighting="maps"), 8, 4, Limits(now=3, next=2, total=4, penalty=1.0))
+    return Refiner(
+        transitions_of(toy_experience(), weighting="maps"), 8, 4, Limits(now=3, next=2, total=4, penalty=1.0)
+    )
 
 
 def test_questions_that_agree_are_asked_once() -> None:
