@@ -14,7 +14,7 @@ A domain is a family of partially observable tasks for a robot in a grid:
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, TypeAlias, runtime_checkable
 
@@ -23,6 +23,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from domains.recording import RecordedSteps as RecordedSteps
 from domains.recording import StepRecorder as StepRecorder
+from domains.symmetry import Symmetries as Symmetries
+from domains.symmetry import Symmetry as Symmetry
+from domains.symmetry import symmetries_of as symmetries_of
 
 EMPTY, WALL, GOAL, UNSEEN = 0, 1, 2, 3
 """Cell kinds of a view; a grid has only the first three."""
@@ -38,8 +41,6 @@ OUTCOMES = ("", "success", "agent_at_goal", "lost", "unescorted", "timeout")
 Task: TypeAlias = Literal["crossing", "following"]
 
 Weighting: TypeAlias = Literal["visits", "maps"]
-"""What a transition counts as: how often it was met, or on how many maps."""
-
 
 DISCOUNT = 0.9
 """Discount per step where a variant names none of its own."""
@@ -122,8 +123,8 @@ class DomainSpec:
     tasks: tuple[str, ...] = ("crossing", "following")
     outcomes: tuple[str, ...] = OUTCOMES
     weighting: Weighting = "visits"
-    """What a transition counts as where a world model is learned. `visits` unless the task needs another: chances come
-    out right. `maps` where a model must not depend on where the behaviour that collected experience liked to go."""
+    """What a transition counts as in learning: how often it was met, or, where a task needs a model that does not
+    depend on where the behaviour that collected experience liked to go, on how many maps (chances are lost)."""
     discounts: Mapping[str, float] = field(default_factory=dict, hash=False)
     """Discount per step of each variant that does not have the usual one; ask `discount`."""
 
@@ -135,36 +136,6 @@ class DomainSpec:
     def num_cell_kinds(self) -> int:
         """Number of kinds a cell of a view can have."""
         return len(self.cell_kinds)
-
-
-@dataclass(frozen=True)
-class Symmetry:
-    """A change of views and actions that the world takes no notice of: the image of a step is a step as likely."""
-
-    name: str
-    actions: tuple[int, ...]
-    """Action a becomes `actions[a]`; each action comes once."""
-    views: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]
-    """The images `[n, v, v]` of views `[n, v, v]`, no two views with the same one."""
-
-    def __post_init__(self) -> None:
-        if sorted(self.actions) != list(range(len(self.actions))):
-            raise DomainError(f"symmetry '{self.name}': actions must hold each of 0..A-1 once, got {self.actions}")
-
-
-@runtime_checkable
-class Symmetries(Protocol):
-    """What a domain may offer besides: symmetries of its worlds. Steps learned from then count for their images too."""
-
-    @property
-    def symmetries(self) -> tuple[Symmetry, ...]:
-        """Symmetries that hold on every map and variant taken together; those they make up need not be listed."""
-        ...
-
-
-def symmetries_of(domain: Domain | None) -> tuple[Symmetry, ...]:
-    """The symmetries that a domain declares; none where it declares nothing."""
-    return tuple(domain.symmetries) if isinstance(domain, Symmetries) else ()
 
 
 @runtime_checkable

@@ -30,10 +30,9 @@ def with_images(
     """
     t = transitions
     for symmetry in symmetries:
-        if len(symmetry.actions) != t.num_actions:
-            raise UserError(
-                f"symmetry '{symmetry.name}' is of {len(symmetry.actions)} actions, the world has {t.num_actions}"
-            )
+        if sorted(symmetry.actions) != list(range(t.num_actions)):
+            known = f"each of 0..{t.num_actions - 1} once"
+            raise UserError(f"symmetry '{symmetry.name}': actions must hold {known}, got {symmetry.actions}")
     views = _closed(t.views, symmetries) if views is None else views
     keys = view_keys(views)
     index = _places(keys, t.views)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from domains.core import DomainError, Symmetry, load_domain, symmetries_of
+from domains.core import Symmetry, load_domain, symmetries_of
 from nesy.errors import UserError
 from nesy.world_model.distinct import Transitions, from_edges, reference_transitions, transitions_of, view_keys
 from nesy.world_model.images import with_images
@@ -73,10 +73,9 @@ def test_images_are_those_of_a_plain_search(symmetries: list[Symmetry], seed: in
 
 def test_what_is_no_symmetry_is_refused(toy) -> None:  # type: ignore[no-untyped-def]
     plain = transitions_of(toy)
-    with pytest.raises(DomainError, match="each of 0..A-1 once"):
-        Symmetry("twice", (0, 0, 1, 2), lambda views: views)
     for symmetry, message in (
-        (Symmetry("three", (1, 0, 2), lambda views: views[:, ::-1]), "of 3 actions, the world has 4"),
+        (Symmetry("three", (1, 0, 2), lambda views: views[:, ::-1]), r"each of 0\.\.3 once, got \(1, 0, 2\)"),
+        (Symmetry("twice", (0, 0, 1, 2), lambda views: views), "each of"),
         (Symmetry("flat", (0, 1, 2, 3), lambda views: np.zeros_like(views)), "two views the same image"),
         (Symmetry("cut", (0, 1, 2, 3), lambda views: views[:, 1:]), "makes views"),
         (Symmetry("kinds", (0, 1, 2, 3), lambda views: views + 7), "cells of views"),
