@@ -30,12 +30,7 @@ from nesy.world_model.codes.readability import readability
 from nesy.world_model.codes.refinement import Refiner
 from nesy.world_model.columns import Columns
 from nesy.world_model.distinct import view_keys
-from nesy.world_model.training.gates import book_nll
-from nesy.world_model.training.held_out import HeldOut
 from nesy.world_model.images import with_images
-from nesy.world_model.codes.questions import Questions
-from nesy.world_model.codes.readability import readability
-from nesy.world_model.codes.refinement import Refiner
 from nesy.world_model.structure import Limits
 from nesy.world_model.training.gates import book_nll
 from nesy.world_model.training.held_out import HeldOut

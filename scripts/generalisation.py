@@ -13,7 +13,6 @@ import numpy as np
 import tyro
 
 from domains.core import load_domain, symmetries_of
-from nesy.log.collection import collect
 from nesy.config import CollectConfig, TrainConfig
 from nesy.log.collection import collect
 from nesy.log.experience import Experience

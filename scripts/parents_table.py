@@ -23,12 +23,11 @@ from nesy.log.experience import Experience
 from nesy.run_folder import RunFolder
 from nesy.world_model import Transitions, reference_transitions
 from nesy.world_model.codes.code_search import CodeSearch
-from nesy.world_model.distinct import transitions_of, view_keys
-from nesy.world_model.training.gates import limits
-from nesy.world_model.images import with_images
 from nesy.world_model.codes.questions import Questions
 from nesy.world_model.codes.readability import readability
 from nesy.world_model.codes.refinement import CodeBook, Refiner
+from nesy.world_model.distinct import transitions_of, view_keys
+from nesy.world_model.images import with_images
 from nesy.world_model.structure import Limits
 from nesy.world_model.tables import all_tables, log_probability
 from nesy.world_model.training.gates import limits

@@ -19,7 +19,6 @@ from domains.core import (
     Symmetry,
     ViewGeometry,
 )
-from domains.person_following.oracles.enumeration import all_maps, all_transitions, all_views
 from domains.person_following.experts import LastSeenFollower
 from domains.person_following.metrics import belief_metrics, episode_metrics
 from domains.person_following.oracles.enumeration import all_maps, all_transitions, all_views

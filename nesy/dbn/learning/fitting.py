@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike
 
 from nesy.dbn.checked_steps import Steps
 from nesy.dbn.learning.extraction import Marginals, marginals, with_counts
+from nesy.dbn.learning.structure import Search, learn_parents
 from nesy.dbn.model import TwoSliceDBN, topological_order
 from nesy.dbn.rows import unique_rows
-from nesy.dbn.learning.structure import Search, learn_parents
 
 
 def from_experience(

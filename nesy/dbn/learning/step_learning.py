@@ -15,7 +15,6 @@ from nesy.dbn.learning.structure import Candidates, Search, learn_parents
 from nesy.dbn.model import TwoSliceDBN
 from nesy.dbn.rows import distinct_values
 from nesy.dbn.step_tables import MAX_ENTRIES, Parents, StepTable
-from nesy.dbn.learning.structure import Candidates, Search, learn_parents
 from nesy.errors import UserError
 
 OBSERVATION = Search(max_parents=4, exhaustive=2)

@@ -28,13 +28,7 @@ from nesy.world_model.codec import SymbolicCodec
 from nesy.world_model.codes.readability import readability
 from nesy.world_model.columns import Columns
 from nesy.world_model.distinct import Transitions, reference_transitions
-from nesy.world_model.training.gates import evaluate
-from nesy.world_model.training.held_out import HeldOut
 from nesy.world_model.images import with_images
-from nesy.world_model.training.imagination import imagined_rollouts
-from nesy.world_model.training.logs import MetricsLog
-from nesy.world_model.training.paper_training import PaperTrainer
-from nesy.world_model.codes.readability import readability
 from nesy.world_model.storage import load_tensors, save_tensors, save_world_model
 from nesy.world_model.training.gates import evaluate
 from nesy.world_model.training.held_out import HeldOut

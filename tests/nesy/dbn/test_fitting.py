@@ -6,15 +6,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nesy.dbn.codebook import Codebook
-from nesy.dbn.learning.extraction import extract
-from nesy.dbn.learning.fitting import from_callable, from_experience
+from nesy.dbn.evaluation.measures import fidelity
+from nesy.dbn.evaluation.recovery import compare_arcs, random_model, random_transitions, recover
 from nesy.dbn.inference.exact import likely_next
 from nesy.dbn.inference.kernels import packed, sample_codes
-from nesy.dbn.evaluation.measures import fidelity
-from nesy.dbn.model import TwoSliceDBN
-from nesy.dbn.evaluation.recovery import compare_arcs, random_model, random_transitions, recover
+from nesy.dbn.learning.extraction import extract
+from nesy.dbn.learning.fitting import from_callable, from_experience
 from nesy.dbn.learning.step_learning import with_observation, with_outcomes
 from nesy.dbn.learning.structure import Search
+from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
 from nesy.formats import export, read
 from tests.nesy.dbn.models import random_dbn
@@ -312,7 +312,7 @@ def test_tables_are_as_large_as_their_limit_allows():
 
 
 def test_transitions_of_another_model_are_not_counted():
-    from nesy.dbn.extraction import with_counts
+    from nesy.dbn.learning.extraction import with_counts
 
     dbn = from_experience(CODES, ACTIONS, LATER, num_values=2)
     for columns, message in (

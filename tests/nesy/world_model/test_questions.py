@@ -5,9 +5,10 @@ import pytest
 
 from nesy.world_model.codes.code_search import CodeSearch
 from nesy.world_model.codes.counting import count, edges_of, families_of, logs_up_to
-from nesy.world_model.distinct import transitions_of
 from nesy.world_model.codes.questions import GroupSearch, Questions
 from nesy.world_model.codes.refinement import Refiner
+from nesy.world_model.codes.telling import telling_cost
+from nesy.world_model.distinct import transitions_of
 from nesy.world_model.structure import Limits
 from tests.nesy.conftest import toy_experience
 

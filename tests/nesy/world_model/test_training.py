@@ -14,9 +14,9 @@ import torch
 
 from domains.core import DomainError, DomainSpec, load_domain
 from nesy.config import TrainConfig
-from nesy.dbn.extraction import extract
+from nesy.dbn.learning.extraction import extract
 from nesy.errors import UserError
-from nesy.experience import COLUMNS, Experience
+from nesy.log.experience import COLUMNS, Experience
 from nesy.progress import SilentProgress, Task
 from nesy.world_model import SymbolicCodec, load_world_model, save_world_model, train
 from nesy.world_model.storage import load_tensors
