@@ -31,9 +31,7 @@ class PersonFollowing:
     """The domain of the paper and its variants."""
 
     # The paper's model of the view is one of the world, not of where the experts that collected experience walked.
-    spec = DomainSpec(
-        name="person_following", variants=tuple(VARIANTS), discounts=DISCOUNTS, weighting="maps"
-    )
+    spec = DomainSpec(name="person_following", variants=tuple(VARIANTS), discounts=DISCOUNTS, weighting="maps")
     symmetries = (Symmetry("mirror image", (RIGHT, LEFT, FORWARD, STAY), lambda views: views[:, ::-1]),)
     """The mirror image of a map about its diagonal is a map as likely, and left and right change places in it."""
 
