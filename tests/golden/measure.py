@@ -18,19 +18,16 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
-SMALL = (
-    *("--jobs", "1", "--json", "--inputs", "full", "--influences", "perspective-shift"),
-    *("--planner-episodes", "3", "--search.simulations", "30", "--search.pomdp-py-simulations", "4"),
-)
-DQN = ("--dqn.episodes", "96", "--dqn.num-envs", "16", "--dqn.warm-up", "64")
+SMALL = {"inputs": ("full",), "influences": ("perspective-shift",), "planner_episodes": 3}
+DQN = {"episodes": 96, "num_envs": 16, "warm_up": 64}
 PAPER = ("search", "qmdp", "pomdp", "greedy-follower", "greedy-last-seen", "random", "optimum", "bayes-optimum", "dqn")
 OTHERS = ("search", "greedy-follower", "greedy-last-seen", "random")
 """`search` is the agent with the hand-structured models of minds and maps here."""
 COMPARISONS = (
-    (("paper",), PAPER, (*DQN, "--episodes", "42")),
-    (("intent", "false_belief", "occluded"), OTHERS, ("--search.practice-episodes", "1000", "--episodes", "6")),
+    (("paper",), PAPER, {"episodes": 42}, 300),
+    (("intent", "false_belief", "occluded"), OTHERS, {"episodes": 6}, 1000),
 )
-"""Variants, agents, options."""
+"""Variants, agents, settings, practice episodes."""
 FIGURE4 = ("--episodes", "40", "--seeds", "0", "--final", "20", "--dqn.num-envs", "8", "--dqn.warm-up", "64")
 RULES = "forbidden(forward) :- now(wall_ahead).\nforbidden(forward) :- now(person_ahead).\n"
 PROGRAM = """candidate(I,C) :- holds(I,wall_ahead), holds(I,goal_visible), seen(I,C).
@@ -129,11 +126,17 @@ def questions(run: Path, work: Path) -> dict[str, Any]:
 
 
 def returns(run: Path, work: Path) -> dict[str, Any]:
-    """What every agent got in every episode, on every variant."""
+    """What every agent got in every episode, on every variant; without the replays that `nesy compare` adds."""
+    from nesy.run_folder import RunFolder
+    from planners.compare import compare
+    from planners.config import CompareConfig, DQNConfig, SearchConfig
+
     folder = Path(shutil.copytree(run, work / "returns"))
     found = {}
-    for variants, agents, options in COMPARISONS:
-        answer("compare", "--run", str(folder), *SMALL, *options, "--variants", *variants, "--agents", *agents)
+    for variants, agents, settings, practice in COMPARISONS:
+        search = SearchConfig(simulations=30, pomdp_py_simulations=4, practice_episodes=practice)
+        sizes = {**SMALL, **settings, "dqn": DQNConfig(**DQN), "search": search}
+        compare(RunFolder(folder), CompareConfig(variants=variants, agents=agents, **sizes))
         found |= played(folder)
     return found
 
