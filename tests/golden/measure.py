@@ -21,8 +21,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SMALL = {"inputs": ("full",), "influences": ("perspective-shift",)}
 DQN = {"episodes": 96, "num_envs": 16, "warm_up": 64}
 PAPER = ("search", "qmdp", "pomdp", "greedy-follower", "greedy-last-seen", "random", "optimum", "bayes-optimum", "dqn")
-OTHERS = ("search", "greedy-follower", "greedy-last-seen", "random")
-"""`search` is the agent with the hand-structured models of minds and maps here."""
+OTHERS = ("structured", "greedy-follower", "greedy-last-seen", "random")
 COMPARISONS = (
     ("paper", PAPER, {"episodes": 42, "planner_episodes": 3}, 300),
     ("intent", OTHERS, {"episodes": 6, "planner_episodes": 2}, 300),
@@ -130,7 +129,7 @@ def questions(run: Path, work: Path) -> dict[str, Any]:
 def returns(run: Path, work: Path) -> dict[str, Any]:
     """What every agent got in every episode, on every variant; without the replays that `nesy compare` adds."""
     from nesy.run_folder import RunFolder
-    from planners.compare import compare
+    from planners.comparison.compare import compare
     from planners.config import CompareConfig, DQNConfig, SearchConfig
 
     folder = Path(shutil.copytree(run, work / "returns"))

@@ -19,7 +19,7 @@ from tests.golden.measure import PARTS, machine
 
 ALIKE = 1e-6
 ELSEWHERE = 0.05
-FROM_NETWORKS = ("dqn", "search", "qmdp", "pomdp")
+FROM_NETWORKS = ("dqn", "search", "structured", "qmdp", "pomdp")
 """Agents whose play follows from networks or the tables made of them."""
 NUMBER = re.compile(r"-?\d+\.\d+(?:e-?\d+)?|-?\d+e-?\d+|\d+ %")
 
