@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from domains.vocabulary import OUTCOMES
+
 if TYPE_CHECKING:
     from domains.core import BatchedEnvironment
 
@@ -103,3 +105,57 @@ class StepRecorder:
             columns = [np.stack(column) for column in zip(*self._rows, strict=True)]
         action, reward, distance, visible, person_action, outcome, before, after = columns
         return RecordedSteps(action, reward, distance, visible, person_action, outcome, before, after, extra)
+
+
+class FinishedEpisodes:
+    """Recorded steps by finished episode, ordered by environment and then in time.
+
+    Attributes:
+        number: [S], the episode that each step of a finished episode belongs to.
+        first: [E], each episode's first step among those.
+    """
+
+    def __init__(self, steps: RecordedSteps) -> None:
+        """Find the episodes."""
+        self.recorded = steps
+        ended = (steps.outcome.T != 0).astype(np.int64)
+        before = np.cumsum(ended, axis=1) - ended
+        kept = before < ended.sum(axis=1, keepdims=True)
+        self._at = np.flatnonzero(kept)
+        self._environment, self._episode = np.nonzero(kept)[0], before[kept]
+        new = (np.diff(self._environment) != 0) | (np.diff(self._episode) != 0)
+        self.number = np.cumsum(np.r_[True, new])[: len(self._at)] - 1
+        self.first = np.nonzero(np.diff(self.number, prepend=-1))[0]
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    def of(self, values: NDArray[Any]) -> NDArray[Any]:
+        """The values [T, B, ...] of the finished episodes' steps, [S, ...]."""
+        return np.moveaxis(values, 1, 0).reshape(-1, *values.shape[2:])[self._at]
+
+    def total(self, values: NDArray[Any]) -> NDArray[np.float64]:
+        """Sums of values [S] by episode [E]."""
+        return np.asarray(np.bincount(self.number, np.asarray(values, np.float64), len(self)), np.float64)
+
+    def plain(self) -> dict[str, NDArray[Any]]:
+        """Arrays [E]: `environment`, `episode`, `return`, `steps`, and 1 under the name of the outcome, else 0."""
+        ends = np.append(self.first[1:], len(self._at)) - 1 if len(self) else self.first
+        outcome = self.of(self.recorded.outcome)[ends]
+        return {
+            "environment": self._environment[self.first],
+            "episode": self._episode[self.first],
+            "return": self.total(self.of(self.recorded.reward)),
+            "steps": np.bincount(self.number, minlength=len(self)),
+            **{name: (outcome == code).astype(np.float64) for code, name in enumerate(OUTCOMES[1:], start=1)},
+        }
+
+    def extra(self) -> dict[str, NDArray[np.float64]]:
+        """Means [E] of the further values over the steps that have one; NaN where none has."""
+        means = {}
+        for name, values in self.recorded.extra.items():
+            some = self.of(values)
+            there = ~np.isnan(some)
+            known = self.total(there)
+            means[name] = np.where(known > 0, self.total(np.where(there, some, 0.0)) / np.maximum(known, 1), np.nan)
+        return means

@@ -61,6 +61,7 @@ class LastSeenFollower(Unbelieving):
     model = "none"
 
     def __init__(self, domain: Domain, variant: str) -> None:
+        domain.last_seen_follower(1, variant)  # where there is none, it says so before anything is played
         self.domain, self.variant = domain, variant
         self.follower: ObservationPolicy | None = None
 

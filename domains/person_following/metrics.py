@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from domains.core import FORWARD, LEFT, OUTCOMES, RIGHT, STAY
-from domains.recording import RecordedSteps
+from domains.core import FORWARD, LEFT, RIGHT, STAY
+from domains.recording import FinishedEpisodes, RecordedSteps
 
 METRICS: dict[str, str] = {
     "return": "sum of rewards",
@@ -65,24 +65,14 @@ def episode_metrics(
         `episode` (0 for the first of its environment), every name of `METRICS` and every name of `steps.extra`
         (means over the steps that have a value; NaN where none has).
     """
-    environment, episode, at = _finished(steps.outcome)
-    number = np.cumsum(np.r_[True, (np.diff(environment) != 0) | (np.diff(episode) != 0)])[: len(at)] - 1
-    first = np.nonzero(np.diff(number, prepend=-1))[0]
-    count = len(first)
-
-    def of(values: NDArray[Any]) -> NDArray[Any]:
-        """The values of the finished episodes' steps, [S]."""
-        return np.moveaxis(values, 1, 0).reshape(-1, *values.shape[2:])[at]
-
-    def total(values: NDArray[Any]) -> NDArray[np.float64]:
-        """Sums by episode [E]."""
-        return np.asarray(np.bincount(number, np.asarray(values, np.float64), count), np.float64)
-
+    episodes = FinishedEpisodes(steps)
+    of, total = episodes.of, episodes.total
+    number, first, count = episodes.number, episodes.first, len(episodes)
     length = np.bincount(number, minlength=count)
-    time = np.arange(len(at)) - first[number] + 1
+    time = np.arange(len(number)) - first[number] + 1
     person = of(steps.person_action)
     before, after = of(steps.pose_before).astype(np.int64), of(steps.pose_after).astype(np.int64)
-    held = (time % robot_rest == 0) if robot_rest else np.zeros(len(at), np.bool_)
+    held = (time % robot_rest == 0) if robot_rest else np.zeros(len(number), np.bool_)
     action = np.where(held, STAY, of(steps.action))
     moved = _robot_moved(before, after, action, person)
     turned = (action == LEFT) | (action == RIGHT)
@@ -90,12 +80,7 @@ def episode_metrics(
     far = of(steps.distance) > follow_distance
     # Nobody can arrive together before the person has made its moves: those are the shortest time there is.
     shortest = np.maximum(total((person != STAY) & (person >= 0)), 1.0)
-    ends = np.append(first[1:], len(at)) - 1 if count else first
-    outcome = of(steps.outcome)[ends]
-    columns: dict[str, NDArray[Any]] = {"environment": environment[first], "episode": episode[first]}
-    columns["return"], columns["steps"] = total(of(steps.reward)), length
-    for code, name in enumerate(OUTCOMES[1:], start=1):
-        columns[name] = (outcome == code).astype(np.float64)
+    columns = episodes.plain()
     columns["spl"] = columns["success"] * shortest / np.maximum(shortest, length)
     columns["path_length"] = total(moved)
     columns["heading_changes"] = total(turned)
@@ -110,24 +95,7 @@ def episode_metrics(
     columns["visibility"] = total(of(steps.visible)) / length
     columns["time_lost"] = total(far) / length
     columns["recovery_time"] = _recovery_time(far, number, first, count)
-    columns = {name: columns[name] for name in ("environment", "episode", *METRICS)}
-    for name, values in steps.extra.items():
-        some = of(values)
-        there = ~np.isnan(some)
-        known = total(there)
-        columns[name] = np.where(known > 0, total(np.where(there, some, 0.0)) / np.maximum(known, 1), np.nan)
-    return columns
-
-
-def _finished(
-    outcome: NDArray[np.integer[Any]],
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Environment, episode and place in the flattened [B, T] of every step [S] of a finished episode."""
-    ended = (outcome.T != 0).astype(np.int64)
-    before = np.cumsum(ended, axis=1) - ended
-    kept = before < ended.sum(axis=1, keepdims=True)
-    environment, _ = np.nonzero(kept)
-    return environment, before[kept], np.flatnonzero(kept)
+    return {name: columns[name] for name in ("environment", "episode", *METRICS)} | episodes.extra()
 
 
 def _recovery_time(

@@ -44,6 +44,7 @@ MAX_PERSONS = 8
 _HEADINGS = {"never": HEADING_NEVER, "always": HEADING_ALWAYS, "unless-0": HEADING_UNLESS_0}
 _STARTS = {"corner": START_CORNER, "near": START_NEAR, "free": START_FREE}
 _KNOWLEDGE = ("map", "seen")
+_ENDS = ("truncated", "terminated")
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,9 @@ class Parameters:
     """Persons in the map; the first is to be followed, the others walk about and stand in the way."""
     keep_waiting: bool = True
     """Whether the waiting counter lives on into the next episode (the quirk of the paper)."""
+    lost_ends: Literal["truncated", "terminated"] = "truncated"
+    """How an episode ends where the person is lost, or at its goal alone: as the paper's code has it (`truncated`), or
+    in Gymnasium's words (`terminated`): there truncation is what a clock does, and learners bootstrap then."""
 
     def __post_init__(self) -> None:
         """Check every value.
@@ -130,8 +134,13 @@ class Parameters:
         for name in ("person_rest", "robot_rest"):
             if getattr(self, name) == 1:
                 raise DomainError(f"{name} must be 0 (never) or at least 2, got 1: nobody would ever move")
-        choices = (("compare_heading", _HEADINGS), ("person_start", _STARTS), ("person_knows", _KNOWLEDGE))
-        for name, known in choices:
+        choices = {
+            "compare_heading": _HEADINGS,
+            "person_start": _STARTS,
+            "person_knows": _KNOWLEDGE,
+            "lost_ends": _ENDS,
+        }
+        for name, known in choices.items():
             if getattr(self, name) not in known:
                 raise DomainError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
 

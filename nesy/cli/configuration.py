@@ -26,7 +26,7 @@ class RunConfig:
     preset: PresetName = "quick"
     """Where the other settings started from."""
     domain: str = "person_following"
-    """Which domain of the package `domains`."""
+    """Which world: `person_following`, or one of your own as `package.module:ATTRIBUTE`."""
     variant: str = "paper"
     """Variant of the task that the run is about."""
     seed: int = 0

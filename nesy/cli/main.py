@@ -76,7 +76,7 @@ def _run(name: str, arguments: list[str]) -> int:
         options = parse(command, f"nesy {name}", arguments)
     except SystemExit as request:  # --help was asked for and has been printed
         return int(request.code or 0)
-    except UserError as error:
+    except (UserError, DomainError) as error:
         return _mistake(str(error))
     before = signal.signal(signal.SIGTERM, _interrupt)
     try:

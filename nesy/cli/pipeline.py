@@ -24,7 +24,7 @@ from nesy.cli import configuration
 from nesy.cli.configuration import PRESETS, PresetName, RunConfig
 from nesy.errors import UserError
 from nesy.progress import ConsoleProgress, Progress
-from nesy.run_folder import RunFolder, write_json
+from nesy.run_folder import RunFolder, read_json, write_json
 
 # What each step leaves in the run folder, in pipeline order: redoing a step removes its own and all later ones.
 OUTPUTS: dict[str, tuple[str, ...]] = {
@@ -52,10 +52,13 @@ class CommonArguments:
     run: Path = Path("runs/default")
     """The run folder."""
     preset: PresetName | None = None
-    """Settings to start from: smoke, quick or paper (default: those of the run, or quick for a new one). Domain,
-    variant and seed stay those of the run."""
+    """Settings to start from: smoke, quick or paper (default: those of the run, or quick for a new one). World, variant
+    and seed stay those of the run."""
+    world: str | None = None
+    """The world: person_following, or a domain of your own as package.module:ATTRIBUTE, whose module is also looked
+    for in the current folder (default: that of the run, or person_following)."""
     variant: str | None = None
-    """Variant of the task (default: that of the run, or paper)."""
+    """Variant of the world (default: that of the run, or the world's first: paper)."""
     seed: int | None = None
     """Seed of everything random (default: that of the run, or 0)."""
     jobs: int = 2
@@ -69,20 +72,27 @@ class CommonArguments:
 def base_config(arguments: list[str]) -> RunConfig:
     """The configuration that the options on the command line then change.
 
-    That is the run's own, or the preset's when one is named or the run is new; a preset says how much is done, not in
-    which world: domain, variant and seed of a run that is there stay. With another variant, that is what is compared.
-    It has to be known before the other options are parsed, so that their help shows the values that would really be
-    used.
+    That is the run's own, or the preset's when one is named or the run is new. World, variant and seed are the run's
+    own even then; with another variant, that is what is compared. It has to be known before the other options are
+    parsed, so that their help shows the values that would really be used.
     """
-    run, preset = Path(option(arguments, "--run") or CommonArguments.run), option(arguments, "--preset")
-    prepared = configuration.load(run / "config.json") if (run / "config.json").is_file() else None
-    named = PRESETS.get(preset or "")
-    if named is not None and prepared is not None:
-        config, variant = replace(named, domain=prepared.domain, seed=prepared.seed), prepared.variant
-    else:
-        config = named or prepared or PRESETS["quick"]
-        variant = config.variant
-    variant = option(arguments, "--variant") or variant
+    path = Path(option(arguments, "--run") or CommonArguments.run) / "config.json"
+    own = configuration.load(path) if path.is_file() else None
+    preset = PRESETS.get(option(arguments, "--preset") or ("quick" if own is None else ""))
+    config = preset or own or PRESETS["quick"]
+    if own is not None and preset is not None:
+        config = _with_variant(replace(config, domain=own.domain, seed=own.seed), own.variant)
+    world, variant = option(arguments, "--world") or config.domain, option(arguments, "--variant")
+    if variant is None and world != config.domain:
+        from domains.core import load_domain
+
+        variant = load_domain(world).spec.variants[0]
+    config = replace(config, domain=world)
+    return config if variant is None else _with_variant(config, variant)
+
+
+def _with_variant(config: RunConfig, variant: str) -> RunConfig:
+    """The configuration for a variant, which is also what is compared; unchanged where it is for that already."""
     if variant == config.variant:
         return config
     return replace(config, variant=variant, compare=replace(config.compare, variants=(variant,)))
@@ -91,7 +101,7 @@ def base_config(arguments: list[str]) -> RunConfig:
 def config_of(options: CommonArguments) -> RunConfig:
     """The configuration that parsed options refer to: see `base_config`."""
     arguments = ["--run", str(options.run)]
-    for name, value in (("--preset", options.preset), ("--variant", options.variant)):
+    for name, value in (("--preset", options.preset), ("--world", options.world), ("--variant", options.variant)):
         if value is not None:
             arguments += [name, value]
     return base_config(arguments)
@@ -125,12 +135,8 @@ def opened(options: CommonArguments, step: str, **sections: Any) -> Iterator[Pip
     if step != next(iter(OUTPUTS)):
         RunFolder.open(options.run)
     base = config_of(options)
-    config = replace(
-        base,
-        variant=base.variant if options.variant is None else options.variant,
-        seed=base.seed if options.seed is None else options.seed,
-        **sections,
-    )
+    config = replace(base, seed=base.seed if options.seed is None else options.seed, **sections)
+    pipeline = Pipeline(options.run, config, options.jobs)
     _check_names(config)
     pipeline = Pipeline(options.run, _in_world(config), options.jobs)
     with pipeline.run.lock():
@@ -189,13 +195,13 @@ class Pipeline:
             configuration.save(self.config, self.run.config, configuration.versions(self.run.config))
 
     def _check_unchanged(self, old: RunConfig) -> None:
-        shared = ("domain", "variant", "seed")
+        shared = {"domain": "world", "variant": "variant", "seed": "seed"}
         for step in ("collect", "train", "extract"):
             if not self.run.has(step):
                 continue
             changed = [
-                f"{name}: {getattr(old, name)}, now {getattr(self.config, name)}"
-                for name in shared
+                f"{word}: {getattr(old, name)}, now {getattr(self.config, name)}"
+                for name, word in shared.items()
                 if getattr(old, name) != getattr(self.config, name)
             ]
             changed += configuration.differences(getattr(old, step), getattr(self.config, step), f"{step}.")
@@ -268,11 +274,13 @@ class Pipeline:
 
     def collect(self) -> dict[str, Any]:
         """Collect experience."""
-        from domains.core import load_domain
+        from domains.core import TASKS, load_domain
         from nesy.log.collection import collect
 
         if not self.run.has("collect") or "experience" not in self.run.read_summary():
             domain = load_domain(self.config.domain)
+            for task in sorted(set(TASKS) - set(domain.spec.tasks)):
+                say(f"world '{domain.spec.name}' has no task '{task}': its episodes are left out")
             rows = self._timed(
                 "collect",
                 lambda: collect(
@@ -364,6 +372,10 @@ class Pipeline:
         write_json(self.run.results / "comparison.json", cells)
         self._timed("replays", self._record_replays, leaves="compare")
         return {"comparison": cells}
+
+    def left_out(self) -> dict[str, str]:
+        """Agents that the comparison has to do without, and why."""
+        return dict(read_json(self.run.results / "statistics.json").get("left_out", {}))
 
     def _record_replays(self) -> None:
         """Play a few episodes of the comparison again for the report, unless that has been done."""

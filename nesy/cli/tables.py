@@ -23,6 +23,12 @@ def print_comparison(cells: list[dict[str, Any]]) -> None:
         print(note)
 
 
+def print_left_out(left_out: dict[str, str]) -> None:
+    """Print a line for each agent that there is no row of, and why."""
+    for name, reason in left_out.items():
+        print(f"{name} left out: {reason}")
+
+
 def print_wide(table: Table) -> None:
     """Print a table on standard output; wide enough for every cell where that is not a terminal."""
     console = Console(file=sys.stdout)

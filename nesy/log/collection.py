@@ -7,13 +7,15 @@ does not depend on interruptions.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from domains.core import BatchedEnvironment, Domain
+from domains.core import TASKS, BatchedEnvironment, Domain, completed
 from nesy.config import CollectConfig
+from nesy.errors import UserError
 from nesy.log.experience import SOURCES, count_rows, write_part
 from nesy.progress import SILENT, Progress, Task
 
@@ -40,12 +42,16 @@ class Shard:
         return f"part-{self.index:05d}.parquet"
 
 
-def plan(config: CollectConfig) -> list[Shard]:
-    """The shards that a configuration asks for.
+def plan(config: CollectConfig, tasks: Sequence[str] = TASKS) -> list[Shard]:
+    """The shards that a configuration asks for in a world that has some tasks.
 
     Half of the crossing episodes are random and half by the expert. Of the following episodes a quarter is
     random, a quarter by the expert, and the rest switches between the two. As no episode of that task can look
-    around far from the person, half as many again explore its maps without one.
+    around far from the person, half as many again explore its maps without one. Episodes of a task that the world
+    does not have are left out.
+
+    Raises:
+        UserError: nothing is left.
     """
     quarter = config.following_episodes // 4
     episodes = {
@@ -59,10 +65,15 @@ def plan(config: CollectConfig) -> list[Shard]:
     shards: list[Shard] = []
     done = 0
     for source in SOURCES:
+        needed = TASKS if source == "crossing-explore" else source.split("-")[:1]
+        if not set(needed) <= set(tasks):
+            continue
         for number, first in enumerate(range(0, episodes[source], config.shard_episodes)):
             size = min(config.shard_episodes, episodes[source] - first)
             shards.append(Shard(len(shards), source, number, done, size))
             done += size
+    if not shards:
+        raise UserError(f"collect: no episodes to collect; set {' or '.join(f'{task}_episodes' for task in tasks)}")
     return shards
 
 
@@ -88,8 +99,8 @@ def collect(
     Returns:
         The number of rows in all shards.
     """
-    folder = Path(folder)
-    shards = plan(config)
+    folder, domain = Path(folder), completed(domain)
+    shards = plan(config, domain.spec.tasks)
     rows = 0
     with progress.task("collecting experience", sum(shard.episodes for shard in shards)) as task:
         for shard in shards:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from domains.core import MOST_MAPS, UNSEEN, WALL, Domain, DomainError, ViewGeometry, load_domain
+from domains.core import ACTION_NAMES, MOST_MAPS, STAY, UNSEEN, WALL, Domain, DomainError, ViewGeometry, load_domain
 from nesy.log.experience import held_out as drawn_maps
 from nesy.log.experience import load_columns
 from nesy.perspective.operator import PerspectiveShift, TableModel
@@ -39,7 +39,12 @@ class Situations:
 
 
 def situations(domain: Domain, variant: str = "paper") -> Situations | None:
-    """All situations of a variant of the following task; None where its maps are too many (`MOST_MAPS`)."""
+    """All situations of a variant of the following task.
+
+    None where its maps are too many (`MOST_MAPS`) or not listed, or do not list every pose with its four headings.
+    """
+    if domain.spec.action_names != ACTION_NAMES or not domain.spec.has_person:
+        return None
     try:
         grids, _ = domain.maps(variant)
         if len(grids) > MOST_MAPS:
@@ -47,17 +52,18 @@ def situations(domain: Domain, variant: str = "paper") -> Situations | None:
         place, before, action, _ = domain.transitions(variant, task="following")
     except DomainError:
         return None
-    poses = action == 3  # one row per pose: the maps in order, then x, y and heading
+    poses = action == STAY  # one row per pose: the maps in order, then x, y and heading
     place, views = place[poses], before[poses]
     geometry = ViewGeometry(views.shape[1])
     unique, first, index = np.unique(view_keys(views), return_index=True, return_inverse=True)
     rows = []
     for number, grid in enumerate(grids):
         free = grid != WALL
-        free[2, 2] |= int((place == number).sum()) > 4 * int(free.sum())
+        free[min(2, grid.shape[0] - 1), min(2, grid.shape[1] - 1)] |= int((place == number).sum()) > 4 * int(free.sum())
         cells = np.repeat(np.argwhere(free), 4, axis=0)
         here = index[place == number]
-        assert len(cells) == len(here), "transitions are not in the order of the poses"
+        if len(cells) != len(here):
+            return None
         rows.append(_pairs(cells, here, views[first], geometry))
     own, configuration, true = np.concatenate(rows, axis=1)
     size = geometry.num_configurations

@@ -79,7 +79,7 @@ def moments(run: RunFolder, count: int, seed: int = 3, least: int = 3) -> list[M
     """
     config = read_json(run.config)
     domain = load_domain(str(config.get("domain", "person_following")))
-    env = domain.make("following", 4 * count, variant=str(config.get("variant", "paper")), seed=seed)
+    env = domain.make(domain.spec.main_task, 4 * count, variant=str(config.get("variant", "paper")), seed=seed)
     codec = SymbolicCodec(load_world_model(run.world_model))
     shift = PerspectiveShift(codec, "network" if codec.packed() is None else "table")
     found: dict[int, Moment] = {}

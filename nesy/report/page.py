@@ -43,7 +43,10 @@ def write_report(run: RunFolder, progress: Progress = SILENT) -> Path:
     script = "\n".join(['"use strict";', *((templates / name).read_text(encoding="utf-8") for name in SCRIPTS)])
     page = Template((templates / "page.html").read_text(encoding="utf-8")).substitute(
         title=html.escape(f"nesy run: {run.path.name}"),
-        subtitle=html.escape(f"Variant {made.get('variant')}, preset {made.get('preset')}, seed {made.get('seed')}."),
+        subtitle=html.escape(
+            f"World {made.get('domain')}, variant {made.get('variant')}, preset {made.get('preset')}, "
+            f"seed {made.get('seed')}."
+        ),
         style=(templates / "style.css").read_text(encoding="utf-8"),
         navigation="\n".join(navigation),
         sections="\n".join(sections),

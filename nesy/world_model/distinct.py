@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from domains.core import CELL_KINDS, Domain, DomainError, Weighting
+from domains.core import CELL_KINDS, Domain, DomainError, Weighting, completed
 from nesy.checked_arrays import integers
 from nesy.errors import UserError
 from nesy.log.experience import MOST_ACTIONS, Experience
@@ -65,7 +65,7 @@ def view_keys(views: np.ndarray) -> np.ndarray:
         raise UserError(f"views must be square, [n, v, v], found {list(views.shape)}")
     kinds = f"cells of views (kinds {', '.join(CELL_KINDS)})"
     flat = integers(views, kinds, (None, None, None), len(CELL_KINDS)).astype(np.uint8, copy=False)
-    flat = np.ascontiguousarray(flat).reshape(len(views), -1)
+    flat = np.ascontiguousarray(flat).reshape(len(views), int(np.prod(views.shape[1:])))
     cells = flat.shape[1]
     if cells > 31:
         return (flat + 1).view(f"S{cells}").reshape(-1)  # fixed-width strings end at a zero byte, hence + 1
@@ -150,10 +150,10 @@ def checked_actions(actions: np.ndarray, num_actions: int | None) -> tuple[np.nd
 def reference_transitions(domain: Domain, variant: str, task: str = "following") -> Transitions | None:
     """Every step from every pose of every map, each counted once: the set that no behaviour has chosen.
 
-    Returns None where the maps of the variant are too many to list.
+    Returns None where the world does not list them, as the maps of the variant are too many, say.
     """
     try:
-        _, before, action, after = domain.transitions(variant, task=task)
+        _, before, action, after = completed(domain).transitions(variant, task=task)
     except DomainError:
         return None
     unique, first, index = np.unique(view_keys(np.concatenate([before, after])), return_index=True, return_inverse=True)

@@ -14,16 +14,16 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from domains.core import Domain, load_domain
+from domains.core import Domain, load_domain, location_of
 from nesy.progress import SILENT, Progress
 from nesy.run_folder import RunFolder, atomic_path, write_json
 from planners import config as settings
 from planners.comparison.engines.dispatch import run_cells
 from planners.comparison.grid import Cell, cell_path, episodes_evaluated, grid
-from planners.comparison.model_store import ModelStore
+from planners.comparison.model_store import ModelStore, NoModel
 from planners.comparison.optima import count_maps, map_optimum
 from planners.comparison.results import write_results
-from planners.comparison.run_cell import OUT_OF_REACH, result_of
+from planners.comparison.run_cell import OUT_OF_REACH, leave_out, result_of
 from planners.config import CompareConfig
 
 
@@ -56,22 +56,29 @@ def compare(
     cells = grid(config)
     domain = load_domain(domain_name)
     store = ModelStore(run)
-    for variant in config.variants:
-        planning = {cell.agent for cell in cells if cell.variant == variant} & set(settings.PLANNING_AGENTS)
-        if planning:
-            store.learn(domain, variant, config.search_of_cells, seed, "structured" in planning, progress)
     told = {variant: config.at(domain.spec.discount(variant)) for variant in config.variants}
+    for variant in config.variants:
+        planning = [cell for cell in cells if cell.variant == variant and cell.agent in settings.PLANNING_AGENTS]
+        structured = any(cell.agent == "structured" for cell in planning)
+        try:
+            if planning:
+                store.learn(domain, variant, config.search_of_cells, seed, structured, progress)
+        except NoModel as error:
+            for cell in planning:
+                leave_out(run, told[variant], cell, seed, error)
     missing = [cell for cell in cells if result_of(run, told[cell.variant], cell, seed) is None]
     total = sum(_episodes(config, cell) for cell in missing)
     with progress.task("compare", total) as task:
-        run_cells([(cell, run.path, config, seed, domain_name) for cell in missing], jobs, task, engine, address)
-    _report_influence_rules(run, config, domain, cells)
+        where = location_of(domain_name)  # a name registered here means nothing to another process
+        run_cells([(cell, run.path, config, seed, where) for cell in missing], jobs, task, engine, address)
     tables = [pq.read_table(cell_path(run, cell), page_checksum_verification=True) for cell in cells]
     left_out = {
         f"{cell.agent} / {cell.variant}": table.schema.metadata[OUT_OF_REACH].decode()
         for cell, table in zip(cells, tables, strict=True)
         if OUT_OF_REACH in table.schema.metadata
     }
+    played = [cell for cell in cells if f"{cell.agent} / {cell.variant}" not in left_out]
+    _report_influence_rules(run, config, domain, played)
     whole = pa.concat_tables(tables, promote_options="default").replace_schema_metadata(None)
     with atomic_path(run.results / "episodes.parquet") as temporary:
         pq.write_table(whole, temporary, compression="zstd")

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from domains.core import OUTCOMES, STAY, Domain, DomainError, StepRecorder
+from domains.core import OUTCOMES, STAY, Domain, DomainError, StepRecorder, completed
 from planners.agents import Agent, Situation, says_something
 from planners.perception import Codec, Perception, Percepts
 from planners.shielding import ActionMask
@@ -107,8 +107,9 @@ def evaluate(
         two left out), and every metric of the domain (docs/metrics.md); those of beliefs only for agents that
         have one of what the person sees.
     """
+    domain = completed(domain)
     maps = evaluation_maps(domain, variant, episodes)
-    env: Any = domain.make("following", episodes, variant=variant, seed=seed, maps=maps, cycle=True)
+    env: Any = domain.make(domain.spec.main_task, episodes, variant=variant, seed=seed, maps=maps, cycle=True)
     observation, _ = env.reset(seed=seed)
     recorder = StepRecorder(env)
     map_ids = np.array(env.map_ids())

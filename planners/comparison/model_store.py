@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from domains.core import Domain
+from domains.core import ACTION_NAMES, Domain
 from nesy.errors import UserError
 from nesy.progress import SILENT, Progress
 from nesy.run_folder import RunFolder, read_json, write_json
@@ -114,8 +114,16 @@ class ModelStore:
             progress: told of collected episodes.
 
         Raises:
+            NoModel: the world has no person, or one that is never in view.
             UserError: the practice has fewer steps than are to be learned from.
         """
+        name = domain.spec.name
+        if not domain.spec.has_person:
+            raise NoModel(f"world '{name}' has no person, and this agent plans with a model of one")
+        if domain.spec.action_names != ACTION_NAMES:
+            raise NoModel(
+                f"world '{name}' has other actions than {', '.join(ACTION_NAMES)}, which this agent plans with"
+            )
         config = config.at(domain.spec.discount(variant))
         collected = {
             "variant": variant,
@@ -135,6 +143,10 @@ class ModelStore:
         from planners.person_following.ialm_learning import joined, learn_ialm
 
         experience = Experience.load(self.run.experience)
+        if not (experience.configuration > 0).any():
+            raise NoModel(
+                f"in the experience of world '{name}' nobody is ever in view: there is no person to plan with"
+            )
         here = [experience] if self._own_variant() in (None, variant) else []
         if config.practice_episodes:
             stale = before is not None and any(before.get(name) != value for name, value in collected.items())

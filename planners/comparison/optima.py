@@ -26,7 +26,7 @@ def map_optimum(folder: Path, domain: Domain, variant: str) -> Optimum | None:
         return None
     maps = []
     if len(grids) == len(oracle.map_return):
-        env: Any = domain.make("following", len(grids), variant=variant, seed=0, maps=grids, cycle=True)
+        env: Any = domain.make(domain.spec.main_task, len(grids), variant=variant, seed=0, maps=grids, cycle=True)
         env.reset(seed=0)
         maps = [
             {"map_id": int(name), "return": float(value), "success": float(success)}

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from domains.core import Domain
+from domains.core import Domain, DomainError
 from nesy.progress import SILENT, Progress
 from nesy.run_folder import RunFolder
 from planners import config as settings
@@ -166,6 +166,8 @@ def _possible(model: IALM, plain: IALM) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def _reference(cell: Cell, domain: Domain, seed: int) -> Agent:
+    if cell.agent.startswith("greedy") and not domain.spec.has_person:
+        raise DomainError(f"world '{domain.spec.name}' has no person to follow")
     simple: dict[str, Callable[[], Agent]] = {
         "random": lambda: RandomAgent(len(domain.spec.action_names), seed),
         "greedy-follower": OracleFollower,

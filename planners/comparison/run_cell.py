@@ -44,8 +44,8 @@ def run_cell(
 ) -> None:
     """Run one cell and write its episodes (and the trained policy, if it learns).
 
-    An exact oracle that is out of reach on its variant leaves no episodes, and the reason; so does an agent whose model
-    does not exist there.
+    A reference that cannot be had on its variant, such as an exact oracle, leaves no episodes, and the reason; so does
+    an agent whose model does not exist there.
     """
     run, domain = RunFolder(folder), load_domain(domain_name)
     config = config.at(domain.spec.discount(cell.variant))
@@ -55,11 +55,9 @@ def run_cell(
     try:
         built = build_player(cell, run, domain, config, seed, progress, checkpoint)
     except (DomainError, NoModel) as error:
-        if isinstance(error, DomainError) and cell.agent not in settings.ORACLES:
+        if isinstance(error, DomainError) and cell.agent not in settings.REFERENCE_AGENTS:
             raise
-        nothing = {"return": np.zeros(0), "length": np.zeros(0, np.int64), "outcome": np.zeros(0, np.int64)}
-        empty = _table(cell, "eval", nothing, None)
-        _write(run, cell, empty, {"fingerprint": fingerprint, OUT_OF_REACH: str(error)})
+        leave_out(run, config, cell, seed, error)
         return advance(episodes)
     results = evaluate(domain, cell.variant, built.player, episodes, EVALUATION_SEED + cell.seed, advance)
     results["experience_steps"] = np.full(episodes, built.experience_steps)
@@ -68,6 +66,13 @@ def run_cell(
     table = pa.concat_tables([*tables, evaluated], promote_options="default")
     _write(run, cell, table, {"fingerprint": fingerprint})
     checkpoint.unlink(missing_ok=True)
+
+
+def leave_out(run: RunFolder, config: CompareConfig, cell: Cell, seed: int, reason: Exception) -> None:
+    """Write down that a cell's agent cannot be had, and why, in place of its episodes."""
+    nothing = {"return": np.zeros(0), "length": np.zeros(0, np.int64), "outcome": np.zeros(0, np.int64)}
+    metadata = {"fingerprint": _fingerprint(config, cell, seed), OUT_OF_REACH: str(reason)}
+    _write(run, cell, _table(cell, "eval", nothing, None), metadata)
 
 
 def _write(run: RunFolder, cell: Cell, table: pa.Table, metadata: dict[Any, str]) -> None:

@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from domains.core import OUTCOMES, Domain
+from domains.core import OUTCOMES, Domain, completed
 from nesy.errors import UserError
 from nesy.progress import SILENT, Progress
 from nesy.run_folder import atomic_path, parse_json
@@ -223,7 +223,8 @@ class Training:
         self.num_configurations = domain.spec.geometry.num_configurations
         sequence = np.random.SeedSequence([seed, 0xD91])
         self.rng, perception_rng = (np.random.default_rng(child) for child in sequence.spawn(2))
-        self.env: Any = domain.make("following", config.num_envs, variant=variant, seed=int(self.rng.integers(2**31)))
+        task, first_seed = domain.spec.main_task, int(self.rng.integers(2**31))
+        self.env: Any = completed(domain).make(task, config.num_envs, variant=variant, seed=first_seed)
         self.perception = perception or dqn_perception(codec, influence, perception_rng, config)
         generator = torch.Generator().manual_seed(int(self.rng.integers(2**62)))
         observation, _ = self.env.reset(seed=int(self.rng.integers(2**31)))

@@ -279,3 +279,154 @@ def test_what_persons_have_in_mind_is_where_the_state_has_it():
             mistaken += state["believed_goal"] != state["goal"]
         env.step(np.arange(12) % 4 if step % 3 else env.expert_actions("follower"))
     assert mistaken > 0
+
+
+def _vector(num_envs=4, **keywords):
+    return gymnasium.make_vec(IDS[0], num_envs=num_envs, vectorization_mode="vector_entry_point", **keywords)
+
+
+def test_seeds_may_leave_single_environments_as_they_are():
+    plain, mixed = _vector(3), _vector(3)
+    plain.reset(seed=[5, 6, 7])
+    mixed.reset(seed=[5, 6, 7])
+    plain.reset()  # the second episode of each generator
+    expected = plain.unwrapped.map_ids()
+    mixed.reset(seed=[None, 9, None])
+    found = mixed.unwrapped.map_ids()
+    assert found[[0, 2]].tolist() == expected[[0, 2]].tolist()
+    fresh = _vector(1)
+    fresh.reset(seed=9)
+    assert found[1] == fresh.unwrapped.map_ids()[0]
+    unseeded = _vector(2)
+    unseeded.reset(seed=[1, None])
+    fresh.reset(seed=1)
+    assert unseeded.unwrapped.map_ids()[0] == fresh.unwrapped.map_ids()[0]
+
+
+@pytest.mark.parametrize("seed", [[1], [1, None, 2], "12", [True, 1], [-1, 2], [1.5, 2], -3, 1.5, True])
+def test_bad_seeds_leave_everything_as_it_was(seed):
+    env = _vector(2)
+    env.reset(seed=3)
+    before, streams = str(env.unwrapped.states()), env.unwrapped.batch.world.stream.copy()
+    with pytest.raises(DomainError, match="seed"):
+        env.reset(seed=seed)
+    assert str(env.unwrapped.states()) == before
+    assert (env.unwrapped.batch.world.stream == streams).all()
+
+
+def test_a_reset_seed_replaces_the_one_given_when_the_environment_was_made():
+    env = load_domain().make("following", 2, seed=1)
+    env.reset(seed=2)
+    env.reset()
+    other = load_domain().make("following", 2, seed=7)
+    other.reset(seed=2)
+    other.reset()
+    assert (env.map_ids() == other.map_ids()).all()
+
+
+def test_a_reset_changes_no_array_returned_before():
+    env = _vector(3)
+    env.reset(seed=0)
+    for _ in range(3):
+        observation, *_, infos = env.step(np.full(3, 2))
+    kept = observation["view"].copy(), infos["final_obs"]["view"].copy(), infos["distance"].copy()
+    env.reset(seed=8)
+    assert (observation["view"] == kept[0]).all()
+    assert (infos["final_obs"]["view"] == kept[1]).all()
+    assert (infos["distance"] == kept[2]).all()
+
+
+@pytest.mark.parametrize("variant", ["paper", "intent", "false_belief"])
+@pytest.mark.parametrize("mode", ["NextStep", "Disabled"])
+def test_other_autoreset_modes_equal_single_environments(variant, mode):
+    count = 5
+    env = _vector(count, variant=variant, autoreset_mode=mode)
+    singles = [gymnasium.make(IDS[0], variant=variant).unwrapped for _ in range(count)]
+    observation, _ = env.reset(seed=30)
+    for i, single in enumerate(singles):
+        single.reset(seed=30 + i)
+    rng, ended, begun = np.random.default_rng(0), np.zeros(count, bool), 0
+    for _ in range(150):
+        if mode == "Disabled" and ended.any():
+            before = observation["view"].copy()
+            observation, _ = env.reset(options={"reset_mask": ended})
+            for i in np.flatnonzero(ended):
+                assert (observation["view"][i] == singles[i].reset()[0]["view"]).all()
+            assert (observation["view"][~ended] == before[~ended]).all()
+            begun, ended = begun + ended.sum(), np.zeros(count, bool)
+        actions = np.where(rng.random(count) < 0.6, env.unwrapped.expert_actions("follower"), rng.integers(0, 4, count))
+        observation, reward, terminated, truncated, infos = env.step(actions)
+        assert "final_obs" not in infos
+        for i, single in enumerate(singles):
+            if ended[i]:
+                o, info = single.reset()
+                expected = (0.0, False, False, "", info["distance"])
+                begun += 1
+            else:
+                o, r, te, tr, info = single.step(int(actions[i]))
+                expected = (r, te, tr, info.get("outcome", ""), info["distance"])
+            found = (reward[i], terminated[i], truncated[i], infos["outcome"][i], infos["distance"][i])
+            assert found == expected
+            assert (observation["view"][i] == o["view"]).all()
+            assert observation["configuration"][i] == o["configuration"]
+            assert str(env.unwrapped.states()[i]) == str(single.state())
+        ended = terminated | truncated
+    assert begun > 10
+
+
+def test_gymnasiums_wrappers_of_batches_take_the_other_modes():
+    from gymnasium.wrappers.vector import FlattenObservation
+
+    for mode in (gymnasium.vector.AutoresetMode.NEXT_STEP, gymnasium.vector.AutoresetMode.DISABLED):
+        env = FlattenObservation(_vector(2, autoreset_mode=mode))
+        assert env.reset(seed=0)[0].shape == (2, 25 + 101)
+        assert env.step(np.zeros(2, np.int64))[0].shape == (2, 25 + 101)
+    with pytest.raises(ValueError, match="autoreset"):
+        FlattenObservation(_vector(2))
+    with pytest.raises(DomainError, match="autoreset_mode must be one of NextStep, SameStep, Disabled"):
+        _vector(2, autoreset_mode="later")
+
+
+def test_disabled_asks_for_resets():
+    env = _vector(2, autoreset_mode="Disabled", max_steps=1)
+    env.reset(seed=0)
+    env.step(np.zeros(2, np.int64))
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"\[0, 1\]"):
+        env.step(np.zeros(2, np.int64))
+    env.reset(options={"reset_mask": np.array([True, False])})
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"\[1\]"):
+        env.step(np.zeros(2, np.int64))
+
+
+@pytest.mark.parametrize("mask", [[1, 0], np.zeros(2, bool), np.ones(3, bool), True])
+def test_bad_reset_masks_are_refused(mask):
+    env = _vector(2)
+    with pytest.raises(DomainError, match="reset_mask"):
+        env.reset(options={"reset_mask": np.array([True, False])})
+    env.reset(seed=0)
+    with pytest.raises(DomainError, match="reset_mask"):
+        env.reset(options={"reset_mask": mask})
+
+
+def test_ends_of_the_task_are_truncations_unless_gymnasiums_words_are_asked_for():
+    for ends in ("truncated", "terminated"):
+        env = gymnasium.make(IDS[0], lost_ends=ends)
+        batch = _vector(64, lost_ends=ends)
+        batch.reset(seed=0)
+        outcomes = set()
+        for step in range(60):
+            _, _, terminated, truncated, infos = batch.step(np.full(64, 3 if step < 40 else 0))
+            alone = np.isin(infos["outcome"], ["lost", "unescorted"])
+            outcomes |= set(infos["outcome"])
+            assert (terminated[alone] == (ends == "terminated")).all()
+            assert (truncated[alone] == (ends == "truncated")).all()
+        assert "lost" in outcomes
+        env.reset(seed=0)
+        done = False
+        while not done:
+            _, _, terminated, truncated, info = env.step(3)
+            done = terminated or truncated
+        assert (terminated, truncated) == (ends == "terminated", ends == "truncated")
+        assert info["outcome"] in ("lost", "unescorted")
+    with pytest.raises(DomainError, match="lost_ends must be one of"):
+        gymnasium.make(IDS[0], lost_ends="never")

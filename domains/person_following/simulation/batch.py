@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,9 +22,11 @@ from domains.person_following.simulation.world import (
     GOAL_X,
     GOAL_Y,
     HEADING,
+    LAST_ACTION,
     LOST,
     TIME,
     WAITING,
+    Results,
     X,
     Y,
     allocate_results,
@@ -113,19 +115,27 @@ class Batch:
                 raise DomainError(f"the goal cannot be reached from ({x}, {y}), where the {name} starts")
         return cells
 
-    def seed(self, seeds: list[int]) -> None:
+    def seed(self, seeds: Sequence[int | None]) -> None:
         """Make environment i what a new one with `seeds[i]` is: a seed fixes all that follows.
 
-        So the waiting counter, which otherwise lives on from episode to episode, starts at 0 too.
+        So the waiting counter, which otherwise lives on from episode to episode, starts at 0 too. None leaves an
+        environment as it is.
         """
         for i, seed in enumerate(seeds):
-            self.world.stream[i] = seeded_stream(seed)
-        self.world.robot[:, EPISODE] = 0
-        self.world.person[:, WAITING] = 0
+            if seed is not None:
+                self.world.stream[i] = seeded_stream(seed)
+                self.world.robot[i, EPISODE] = 0
+                self.world.person[i, WAITING] = 0
         self.seeded = True
 
-    def checked_options(self, options: dict[str, Any] | None) -> Callable[[], None]:
-        """What begins new episodes everywhere, on a given grid and with a given waiting counter if so wished.
+    def checked_options(
+        self, options: dict[str, Any] | None, chosen: NDArray[np.bool_] | None = None
+    ) -> Callable[[], None]:
+        """What begins new episodes, on a given grid and with a given waiting counter if so wished.
+
+        Args:
+            options: `grid` and `waiting`; None for neither.
+            chosen: [B], where; None for everywhere.
 
         Raises:
             DomainError: an unknown option or a bad value; nothing has changed then.
@@ -140,18 +150,18 @@ class Batch:
             isinstance(waiting, bool) or not isinstance(waiting, int | np.integer) or not 0 <= waiting <= 2
         ):
             raise DomainError(f"option 'waiting' must be 0, 1 or 2, got {waiting!r}")
-        return lambda: self._begin(grid, None if waiting is None else int(waiting))
+        where = np.ones(self.num_envs, np.bool_) if chosen is None else chosen
+        return lambda: self._begin(where, grid, None if waiting is None else int(waiting))
 
-    def _begin(self, grid: NDArray[np.uint8] | None, waiting: int | None) -> None:
-        everywhere = np.ones(self.num_envs, np.bool_)
+    def _begin(self, chosen: NDArray[np.bool_], grid: NDArray[np.uint8] | None, waiting: int | None) -> None:
         if grid is not None:
-            self.world.grid[:] = grid
+            self.world.grid[chosen] = grid
         else:
-            episodes.choose_batch(self.rules, self.world, self.maps, everywhere)
-        self.last.distance[:] = 0
-        self._begin_where(everywhere, self.last.distance)
+            episodes.choose_batch(self.rules, self.world, self.maps, chosen)
+        self.last.distance[chosen] = 0
+        self._begin_where(chosen, self.last.distance)
         if waiting is not None:
-            self.world.person[:, WAITING] = waiting
+            self.world.person[chosen, WAITING] = waiting
 
     def _begin_where(self, chosen: NDArray[np.bool_], gaps: NDArray[np.int64] = _NO_GAPS) -> None:
         """Begin episodes on the maps that lie in the grids; `gaps` [B], if given, gets the distances."""
@@ -177,6 +187,10 @@ class Batch:
         if self._sees_only:
             people.begin_to_think(rules, world, self.store, chosen)
 
+    def detach(self) -> None:
+        """Give `last` arrays of its own, so that what comes next does not change those that callers hold."""
+        self.last = Results._make(array.copy() for array in self.last)
+
     def step(self, actions: NDArray[np.int64], autoreset: bool, reuse: bool = False) -> None:
         """Take a step everywhere; the results lie in `last`, whose arrays are new unless they may be reused."""
         if not reuse:
@@ -185,6 +199,10 @@ class Batch:
         if self._goal_moves:
             people.move_goals(self.rules, self.world)
         ended = kernel.step_batch(self.rules, self.world, self.store, actions, last)
+        if ended and self.parameters.lost_ends == "terminated":
+            alone = (last.outcome == kernel.LOST_PERSON) | (last.outcome == kernel.UNESCORTED)
+            last.terminated[:] |= alone
+            last.truncated[:] &= ~alone
         if self._sees_only or self._goal_moves:
             people.think_batch(self.rules, self.world, self.store)
         if self._others:
@@ -196,6 +214,26 @@ class Batch:
             self._begin_where(last.ended)
         else:
             self.last = last._replace(robot_view=last.final_view, configuration=last.final_configuration)
+
+    def step_or_begin(self, actions: NDArray[np.int64], begins: NDArray[np.bool_]) -> None:
+        """Begin an episode where `begins` [B], take a step elsewhere; the results lie in `last`.
+
+        Where an episode begins, nothing is paid and nothing ends.
+        """
+        rows = np.flatnonzero(begins)
+        before = [array[rows] for array in self.world if len(array) == self.num_envs]
+        self.step(actions, False)
+        if not len(rows):
+            return
+        for array, kept in zip((a for a in self.world if len(a) == self.num_envs), before, strict=True):
+            array[rows] = kept  # as if the step had not been taken there, random numbers included
+        last = self.last
+        last.reward[rows], last.outcome[rows] = 0, 0
+        for flags in (last.terminated, last.truncated, last.ended):
+            flags[rows] = False
+        self._begin(begins, None, None)
+        last.visible[rows] = last.configuration[rows] > 0
+        last.person_action[rows] = self.world.person[rows, LAST_ACTION]
 
     def begin_worlds(self, grids: NDArray[np.uint8], own: NDArray[np.int64]) -> None:
         """Begin environment i on the raw map `grids[i]`, the candidate `own[i]` being the person's goal."""

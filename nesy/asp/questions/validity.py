@@ -32,7 +32,7 @@ def plan_validity(
 
     Args:
         base: the model and its codebook.
-        domain: the real domain; its crossing task is used.
+        domain: the real domain; its crossing task is used, if it has one.
         goal: a predicate of the domain.
         episodes: how many plans.
         warm_up: random steps before a plan is made.
@@ -53,7 +53,7 @@ def plan_validity(
     book = base.codebook
     column = domain.predicates.names.index(goal) if goal in domain.predicates.names else -1
     book.predicate(goal)
-    environment = domain.make("crossing", episodes, variant=variant, seed=seed)
+    environment = domain.make(domain.spec.model_task, episodes, variant=variant, seed=seed)
     rng = np.random.default_rng(seed)
     observation, _ = environment.reset(seed=seed)
     turns = [base.dbn.action_names.index(name) for name in ("left", "right")]

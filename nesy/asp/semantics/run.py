@@ -18,8 +18,8 @@ def semantics_report(run: RunFolder, domain_name: str, variant: str, seed: int) 
     """Scores of the rules in both directions (nesy.asp.semantics.scores), on views and on maps not learned from.
 
     Besides, `recovered`: predicates with a name of their own, read by rules off the codes of ALL views of the
-    crossing task (`views` many), with the share of the views where that is right (`accuracy`). Left out where the
-    domain cannot list its views.
+    crossing task, if there is one (`views` many), with the share of the views where that is right (`accuracy`). Left
+    out where the domain cannot list its views.
     """
     from nesy.log.experience import load_columns
 
@@ -42,7 +42,7 @@ def _recovered(
     try:
         if len(domain.maps(variant)[0]) > MOST_MAPS:
             return None
-        views = domain.views(variant, "crossing")
+        views = domain.views(variant, domain.spec.model_task)
     except DomainError:
         return None
     codes = SymbolicCodec(load_world_model(run.world_model)).codes(views).astype(np.int64)

@@ -26,18 +26,20 @@ def measure(settings: Settings) -> list[Row]:
     import torch
 
     from domains.core import load_domain
+    from nesy.cli import configuration
     from nesy.world_model import SymbolicCodec, load_world_model
     from planners.config import DQNConfig
     from planners.dqn.dqn import Training
     from planners.perception import Perception
 
     torch.set_num_threads(1)
-    domain, model = load_domain(), load_world_model(settings.run.world_model)
+    config = configuration.load(settings.run.config)
+    domain, model = load_domain(config.domain), load_world_model(settings.run.world_model)
 
-    def training(config: DQNConfig) -> Training:
-        endless = replace(config, episodes=10**9)
+    def training(learner: DQNConfig) -> Training:
+        endless = replace(learner, episodes=10**9)
         codec = SymbolicCodec(model)
-        return Training(domain, codec, "paper", "perspective-shift", "paper", endless, settings.seed)
+        return Training(domain, codec, "paper", "perspective-shift", config.variant, endless, settings.seed)
 
     def forgetting(learner: Training) -> Callable[[], None]:
         def forget() -> None:

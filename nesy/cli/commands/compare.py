@@ -42,7 +42,7 @@ def run(options: Arguments) -> dict[str, Any]:
         check_rules(options)
     with pipeline.opened(options, "compare", compare=options.settings) as steps:
         result = steps.compare(options.engine, options.address)
-        result["left_out"] = read_json(steps.run.results / "statistics.json")["left_out"]
+        result["left_out"] = steps.left_out()
         path = steps.run.results / "influence_rules.json"
         return result | ({"influence_rules": read_json(path)} if path.is_file() else {})
 
@@ -66,8 +66,7 @@ def check_rules(options: Arguments) -> None:
 def show(result: dict[str, Any]) -> None:
     """Print the comparison table, what was left out, and what rules about the person changed."""
     tables.print_comparison(result["comparison"])
-    for name, reason in result["left_out"].items():
-        print(f"{name} left out: {reason}")
+    tables.print_left_out(result["left_out"])
     for variant, change in result.get("influence_rules", {}).items():
         if change is not None:
             share = f"{change['constrained']} of {change['codes']} known codes"

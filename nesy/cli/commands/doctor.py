@@ -1,4 +1,4 @@
-"""Check the installation and, with --run, a run folder; say what to do about whatever is wrong."""
+"""Check the installation, a run folder (--run) or a world (--world); say what to do about whatever is wrong."""
 
 from __future__ import annotations
 
@@ -30,6 +30,8 @@ class Arguments:
 
     run: Path | None = None
     """A run folder to check as well."""
+    world: str | None = None
+    """A world to check as well, package.module:ATTRIBUTE: its parts, and every step of nesy run for a moment."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print the result as one JSON object on standard output."""
 
@@ -53,6 +55,8 @@ def run(options: Arguments) -> dict[str, Any]:
     checks = list(_installation())
     if options.run is not None:
         checks += _run_folder(options.run)
+    if options.world is not None:
+        checks += _world(options.world)
     result = {"checks": [vars(check) for check in checks], "bad": sum(check.verdict == "bad" for check in checks)}
     if result["bad"]:
         if options.json:
@@ -163,6 +167,59 @@ def _pomdp_py() -> Check:
     return Check("pomdp-py", "good", importlib.metadata.version("pomdp-py"))
 
 
+# ---------------------------------------------------------------- a world
+def _world(name: str) -> Iterator[Check]:
+    """What `check_domain` finds, and whether a run goes through."""
+    from domains import check_domain
+    from domains.core import load_domain
+
+    def parts() -> str:
+        report = check_domain(load_domain(name))
+        lacking = f"; left out: {', '.join(report.left_out)}" if report.left_out else ""
+        return f"{report.name}, {report.episodes} episodes played{lacking}"
+
+    checked = _readable(f"world {name}", parts, "docs/new-domain.md says what a world has to have")
+    yield checked
+    if checked.verdict == "good":
+        what, advice = "nesy run there", "this is a gap in check_domain: please tell us"
+        try:
+            yield Check(what, "good", _moment(name))
+        except UserError as error:
+            yield Check(what, "bad", str(error)[:300])
+        except Exception as error:  # whatever it is, it is the finding
+            yield Check(what, "bad", f"{type(error).__name__}: {str(error)[:250]}", advice)
+
+
+def _moment(name: str) -> str:
+    """All steps of the pipeline with next to nothing to do, in a folder that is gone afterwards."""
+    from dataclasses import replace
+
+    from domains.core import load_domain
+    from nesy.cli.configuration import PRESETS
+    from nesy.cli.pipeline import Pipeline
+    from nesy.progress import SILENT
+
+    variant = load_domain(name).spec.variants[0]
+    base = PRESETS["smoke"]
+    compare = replace(
+        base.compare,
+        agents=("dqn", "pomdp", "greedy-follower", "random"),
+        influences=("perspective-shift",),
+        variants=(variant,),
+        episodes=2,
+        planner_episodes=1,
+        dqn=replace(base.compare.dqn, episodes=5),
+    )
+    config = replace(base, domain=name, variant=variant, compare=compare, train=replace(base.train, epochs=1))
+    with tempfile.TemporaryDirectory(prefix="nesy-") as folder:
+        work = Pipeline(Path(folder) / "run", config, 1, SILENT)
+        work.configure()
+        for step in (work.collect, work.train, work.extract, work.compare, work.report):
+            step()
+        played = ", ".join(dict.fromkeys(record["agent"] for record in work.run.read_summary()["comparison"]))
+    return f"goes through; agents compared: {played}"
+
+
 # ---------------------------------------------------------------- a run folder
 def _run_folder(path: Path) -> Iterator[Check]:
     from nesy.run_folder import STEPS, RunFolder
@@ -228,7 +285,10 @@ def _files(folder: Any, missing: list[str]) -> Iterator[Check]:
         return f"{len(sections)} sections"
 
     def config() -> str:
-        return f"preset {configuration.load(folder.config).preset}"
+        from domains.core import load_domain
+
+        made = configuration.load(folder.config)
+        return f"preset {made.preset}, world {load_domain(made.domain).spec.name}"
 
     readers: dict[str, Callable[[], str]] = {
         "config": config, "collect": collect, "train": train, "extract": extract, "compare": compare,

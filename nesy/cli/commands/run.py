@@ -32,12 +32,13 @@ def run(options: Arguments) -> dict[str, Any]:
     with pipeline.opened(options, "collect", **sections) as steps:
         for step in (steps.collect, steps.train, steps.extract, steps.compare, steps.report):
             step()
-        return {**steps.run.read_summary(), "report": str(steps.run.report)}
+        return {**steps.run.read_summary(), "left_out": steps.left_out(), "report": str(steps.run.report)}
 
 
 def show(result: dict[str, Any]) -> None:
     """Print the comparison table and where the report is."""
     tables.print_comparison(result["comparison"])
+    tables.print_left_out(result["left_out"])
     seconds = ", ".join(f"{step} {value:.0f} s" for step, value in result["timing"].items())
     print(f"time: {seconds}")
     print(f"report: {result['report']}")

@@ -11,7 +11,6 @@ from nesy.dbn.evaluation.measures import FLOOR, nll, row_differences
 from nesy.dbn.evaluation.recovery import recover
 from nesy.dbn.evaluation.rollouts import rollout_drift
 from nesy.dbn.evaluation.validity import (
-    TASK,
     commonest_successors,
     impossible_steps,
     likeliest_successors,
@@ -68,18 +67,24 @@ def fidelity_report(run: RunFolder, domain_name: str, variant: str, seed: int) -
 
 
 def new_steps(domain: Domain, variant: str, seed: int, codec: Any, envs: int = 128, steps: int = 200) -> Transitions:
-    """Steps of new episodes: half of the environments act at random, half walk to the goal."""
-    environment = domain.make(TASK, envs, variant=variant, seed=seed)
+    """Steps of new episodes: half of the environments act at random, half walk to the goal.
+
+    Steps with another agent in the way are left out, as in training.
+    """
+    environment = domain.make(domain.spec.model_task, envs, variant=variant, seed=seed)
+    from nesy.world_model.distinct import free_ahead
+
     rng = np.random.default_rng(seed)
     observation, _ = environment.reset(seed=seed)
     before, actions, after = [], [], []
     for _ in range(steps):
         action = rng.integers(len(domain.spec.action_names), size=envs)
         action[::2] = environment.expert_actions("goal")[::2]
-        before.append(observation["view"].copy())
-        actions.append(action)
+        free = free_ahead(np.asarray(observation["configuration"]), domain.spec.geometry.view_size)
+        before.append(observation["view"][free])
+        actions.append(action[free])
         observation, _, _, _, infos = environment.step(action)
-        after.append(infos["final_obs"]["view"].copy())
+        after.append(infos["final_obs"]["view"][free])
     return Transitions(np.concatenate(before), np.concatenate(actions), np.concatenate(after), codec.codes)
 
 

@@ -7,14 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from domains.core import MOST_MAPS, Domain, DomainError
+from domains.core import ACTION_NAMES, MOST_MAPS, Domain, DomainError
 from nesy.dbn.inference.exact import likely_next
 from nesy.dbn.inference.kernels import packed, sample_codes
 from nesy.dbn.model import TwoSliceDBN
 from nesy.dbn.rows import code_type, unique_rows
 
-TASK = "crossing"
-"""The task without anybody else: there the next view depends on nothing but the map and the pose."""
 Encode = Callable[[np.ndarray], np.ndarray]
 """Views uint8 [n, v, v] -> codes uint8 [n, N]."""
 
@@ -76,10 +74,9 @@ def walks(
         which pairs count bool [B]: no episode ended meanwhile, and the views differ.
     """
     rng = np.random.default_rng(seed)
-    environment = domain.make(TASK, number, variant=variant, seed=seed)
+    environment = domain.make(domain.spec.model_task, number, variant=variant, seed=seed)
     observation, _ = environment.reset(seed=seed)
-    # forward as often as all turns together, so that walks get somewhere
-    actions = rng.choice(3, size=(before + longest, number), p=(0.25, 0.25, 0.5))
+    actions = rng.choice(len(domain.spec.action_names), size=(before + longest, number), p=_restless(domain))
     length = rng.integers(1, longest + 1, size=number)
     going = np.ones(number, dtype=bool)
     first = second = observation["view"].copy()
@@ -91,6 +88,14 @@ def walks(
         going &= ~(inside & (terminated | truncated))
         second = np.where(inside[:, None, None], observation["view"], second)
     return actions[:before], first, second, going & (first != second).any(axis=(1, 2))
+
+
+def _restless(domain: Domain) -> np.ndarray:
+    """Chances of the actions of a walk: forward as often as both turns together, so that it gets somewhere."""
+    names = domain.spec.action_names
+    if names == ACTION_NAMES:
+        return np.array([0.25, 0.25, 0.5, 0.0])
+    return np.full(len(names), 1.0 / len(names))
 
 
 def plan_validity(
@@ -135,7 +140,7 @@ def _execute(
     domain: Domain, variant: str, seed: int, prefix: np.ndarray, plans: dict[int, list[int]], number: int
 ) -> dict[int, np.ndarray]:
     """The view at the end of every plan; an ending on the way leaves the last view of that episode."""
-    environment = domain.make(TASK, number, variant=variant, seed=seed)
+    environment = domain.make(domain.spec.model_task, number, variant=variant, seed=seed)
     observation, _ = environment.reset(seed=seed)
     for action in prefix:
         observation, *_ = environment.step(action)

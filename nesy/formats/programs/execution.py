@@ -140,7 +140,7 @@ def execute(
     goals = np.unique(codebook.codes[codebook.views[:, ahead[0], ahead[1]] == GOAL], axis=0).astype(np.int64)
     there = {tuple(code) for code in goals.tolist()}
     rng = np.random.default_rng(seed)
-    environment = domain.make("crossing", 1, variant=variant, seed=seed)
+    environment = domain.make(domain.spec.model_task, 1, variant=variant, seed=seed)
     observation, _ = environment.reset(seed=seed)
     result = Executed()
     for _ in range(episodes):

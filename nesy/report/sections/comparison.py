@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import html
 from typing import Any
 
 from nesy.errors import UserError
@@ -35,6 +36,9 @@ def make(run: RunFolder, summary: dict[str, Any]) -> str:
     ]
     if (run.results / "statistics.json").is_file():
         statistics = read_json(run.results / "statistics.json")
+        left_out = [f"{name} left out: {reason}." for name, reason in statistics.get("left_out", {}).items()]
+        if left_out:
+            parts.insert(1, f"<p>{'<br>'.join(map(html.escape, left_out))}</p>")
         parts.append(
             figure(
                 figures.svg(comparison_figures.profiles(statistics["profiles"])),

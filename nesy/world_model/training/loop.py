@@ -120,7 +120,7 @@ def _train(
     if config.mirror_images:
         everything = with_images(everything, symmetries)
     apart = columns.held_out(config.held_out, np.random.default_rng(seed))
-    reference = references.get("crossing", everything)
+    reference = everything if domain is None else references.get(domain.spec.model_task, everything)
     trainer: Trainer
     if config.architecture == "paper":
         held_out = columns.transitions(apart, weighting=config.weighting) if apart.any() else None
@@ -152,7 +152,7 @@ def _train(
     codec = SymbolicCodec(trainer.model)
     metrics: dict[str, Any] = {
         **evaluate(codec, reference, everything.views),
-        **({"following": evaluate(codec, references["following"])} if references else {}),
+        **({"following": evaluate(codec, references["following"])} if "following" in references else {}),
         "held_out": trainer.held_out_figures,
         "rollouts": imagined_rollouts(codec, columns, np.random.default_rng(seed)),
         "architecture": config.architecture,
@@ -170,8 +170,8 @@ def _train(
 
 
 def _references(domain: Domain, variant: str) -> dict[str, Transitions]:
-    """All transitions of both tasks, by task; empty where the maps of the variant are too many to list."""
-    found = {task: reference_transitions(domain, variant, task) for task in ("crossing", "following")}
+    """All transitions of every task, by task; empty where the world does not list them."""
+    found = {task: reference_transitions(domain, variant, task) for task in domain.spec.tasks}
     return {task: transitions for task, transitions in found.items() if transitions is not None}
 
 

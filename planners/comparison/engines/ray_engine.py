@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from domains.core import DomainError
 from nesy.errors import UserError
 from nesy.progress import Task
 from nesy.run_folder import RunFolder, atomic_path
@@ -67,7 +68,8 @@ def run_on_ray(jobs_of: list[CellJob], task: Task, address: str | None = None) -
                     left = ray.get(reference)
                 except ray.exceptions.RayTaskError as error:  # the cell itself went wrong
                     cause = error.as_instanceof_cause()
-                    raise (UserError(str(error.cause)) if isinstance(cause, UserError) else cause) from None
+                    ours = next((kind for kind in (UserError, DomainError) if isinstance(cause, kind)), None)
+                    raise (cause if ours is None else ours(str(error.cause))) from None
                 except ray.exceptions.RayError:  # its worker or node is gone
                     begin(job)
                     continue

@@ -21,7 +21,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from domains.core import Domain, load_domain
+from domains.core import WALL, Domain, load_domain
 from nesy.errors import UserError
 from nesy.progress import SILENT, Progress
 from nesy.run_folder import RunFolder, atomic_path, read_json
@@ -148,7 +148,12 @@ def _play(
     shield = None if perception is None else _shield(config, perception, domain)
     start_maps = evaluation_maps(domain, cell.variant, episodes)
     env: Any = domain.make(
-        "following", episodes, variant=cell.variant, seed=EVALUATION_SEED + cell.seed, maps=start_maps, cycle=True
+        domain.spec.main_task,
+        episodes,
+        variant=cell.variant,
+        seed=EVALUATION_SEED + cell.seed,
+        maps=start_maps,
+        cycle=True,
     )
     observation, _ = env.reset(seed=EVALUATION_SEED + cell.seed)
     active = np.zeros(episodes, np.bool_)
@@ -212,7 +217,7 @@ def _shield(config: CompareConfig, perception: Perception, domain: Domain) -> An
 
 def _scene(state: dict[str, Any], maps: dict[str, int]) -> dict[str, Any]:
     """The true state, its map stored once."""
-    cells = _digits(state["grid"])
+    cells = _digits(_squared(np.asarray(state["grid"])))
     scene: dict[str, Any] = {"map": maps.setdefault(cells, len(maps))}
     for name in ("agent", "person", "goal"):
         if state.get(name) is not None:
@@ -302,6 +307,12 @@ def _rules(shield: Any, percepts: Percepts | None, domain: Domain, i: int) -> di
             "conflict": bool(advice.conflict),
         }
     }
+
+
+def _squared(grid: np.ndarray) -> np.ndarray:
+    """A map [width, height] as a square one: beyond its border there is wall."""
+    side = max(grid.shape)
+    return np.pad(grid, [(0, side - length) for length in grid.shape], constant_values=WALL)
 
 
 def _digits(view: Any) -> str:
