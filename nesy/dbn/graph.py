@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import networkx
 import numpy as np
 
-from nesy.dbn.model import TwoSliceDBN
 from nesy.names import TEXT, sliced
+
+if TYPE_CHECKING:
+    from nesy.dbn.model import TwoSliceDBN
 
 
 def to_networkx(dbn: TwoSliceDBN, action: int | None = None) -> networkx.MultiDiGraph:

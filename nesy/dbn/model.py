@@ -343,7 +343,7 @@ class TwoSliceDBN:
         """
         from nesy.dbn.model_files import load
 
-        return load(Path(path))
+        return load(Path(path), cls)
 
     # ---------------------------------------------------------------- checks
     def _codes(self, code: np.ndarray) -> np.ndarray:

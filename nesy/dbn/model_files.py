@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from nesy.dbn import storage
-from nesy.dbn.model import Parents, TwoSliceDBN
 from nesy.dbn.rows import distinct_rows, expanded_rows, scattered_counts
 from nesy.dbn.step_tables import StepTable
 from nesy.errors import UserError
+
+if TYPE_CHECKING:
+    from nesy.dbn.model import Parents, TwoSliceDBN
 
 FORMAT = "nesy-2dbn"
 VERSION = 1
@@ -47,8 +49,8 @@ def save(dbn: TwoSliceDBN, path: Path) -> None:
     storage.save(path, "model", "tables", document, arrays)
 
 
-def load(path: Path) -> TwoSliceDBN:
-    """Read the folder `path`.
+def load(path: Path, kind: type[TwoSliceDBN]) -> TwoSliceDBN:
+    """Read a `kind` from the folder `path`.
 
     Raises:
         UserError: a file is missing, damaged, or does not hold a 2DBN.
@@ -59,29 +61,29 @@ def load(path: Path) -> TwoSliceDBN:
     if document.get("version") != VERSION:
         raise UserError(f"{path / 'model.json'}: version {document.get('version')!r}, this program reads {VERSION}")
     try:
-        return _build(document, arrays)
+        return kind(**_parts(document, arrays))
     except UserError as error:
         raise UserError(f"{path / 'model.json'}: {error}") from None
     except (KeyError, TypeError, ValueError, OverflowError, IndexError, AttributeError) as error:
         raise UserError(f"{path / 'model.json'}: does not describe a 2DBN ({error!r})") from None
 
 
-def _build(document: dict[str, Any], arrays: dict[str, np.ndarray]) -> TwoSliceDBN:
-    return TwoSliceDBN(
-        factor_names=_strings(document["factor_names"]),
-        num_values=int(document["num_values"]),
-        action_names=_strings(document["action_names"]),
-        parents_now=_parents(document["parents_now"]),
-        parents_next=_parents(document["parents_next"]),
-        order=tuple(int(i) for i in document["order"]),
-        probabilities=expanded_rows(arrays["distinct_rows"], arrays["row_index"]),
-        row_counts=scattered_counts(arrays["met_rows"], arrays["met_counts"], len(arrays["row_index"])),
-        initial=arrays["initial"],
-        value_meanings=tuple(_strings(texts) for texts in document["value_meanings"]),
-        provenance=dict(document["provenance"]),
-        tables={k.removeprefix("table_"): v for k, v in arrays.items() if k.startswith("table_")},
-        step_tables=_step_tables(document, arrays),
-    )
+def _parts(document: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    return {
+        "factor_names": _strings(document["factor_names"]),
+        "num_values": int(document["num_values"]),
+        "action_names": _strings(document["action_names"]),
+        "parents_now": _parents(document["parents_now"]),
+        "parents_next": _parents(document["parents_next"]),
+        "order": tuple(int(i) for i in document["order"]),
+        "probabilities": expanded_rows(arrays["distinct_rows"], arrays["row_index"]),
+        "row_counts": scattered_counts(arrays["met_rows"], arrays["met_counts"], len(arrays["row_index"])),
+        "initial": arrays["initial"],
+        "value_meanings": tuple(_strings(texts) for texts in document["value_meanings"]),
+        "provenance": dict(document["provenance"]),
+        "tables": {k.removeprefix("table_"): v for k, v in arrays.items() if k.startswith("table_")},
+        "step_tables": _step_tables(document, arrays),
+    }
 
 
 def _step_tables(document: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict[str, StepTable]:

@@ -16,7 +16,8 @@ from nesy.dbn.evaluation.validity import (
     likeliest_successors,
     plan_validity,
 )
-from nesy.dbn.learning.extraction import Conditionals, Marginals, Transitions, network_marginals
+from nesy.dbn.learning.extraction import network_marginals
+from nesy.dbn.learning.transitions import Conditionals, Marginals, Transitions
 from nesy.dbn.model import TwoSliceDBN
 
 if TYPE_CHECKING:

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nesy.dbn.inference.factored import predict_batch
-from nesy.dbn.learning.extraction import Conditionals
+from nesy.dbn.learning.transitions import Conditionals
 from nesy.dbn.model import TwoSliceDBN
 from nesy.dbn.rows import unique_rows
 
 if TYPE_CHECKING:
-    from nesy.dbn.learning.extraction import Marginals, Transitions
+    from nesy.dbn.learning.transitions import Marginals, Transitions
 
 FLOOR = 1e-12
 """Least probability that a likelihood is charged with, so that one impossible row does not hide the rest."""

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nesy.dbn.inference.exact import ancestors
+from nesy.dbn.inference.reachable import ancestors
 from nesy.dbn.model import TwoSliceDBN
 from nesy.errors import UserError
 

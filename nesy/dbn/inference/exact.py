@@ -8,12 +8,15 @@ the arcs within slice t+1; only the next belief's factorisation is an approximat
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nesy.dbn.model import TwoSliceDBN
+from nesy.dbn.inference.reachable import ancestors, reachable_values
 from nesy.errors import UserError
+
+if TYPE_CHECKING:
+    from nesy.dbn.model import TwoSliceDBN
 
 Potential = tuple[tuple[int, ...], np.ndarray]
 """Variables and a table with one axis per variable."""
@@ -107,8 +110,6 @@ def plan_marginals(
     Raises:
         UserError: a wrong shape or action, or a model too densely connected for exact inference.
     """
-    from nesy.dbn.inference.plans import reachable_values
-
     n, k = dbn.num_factors, dbn.num_values
     start = np.asarray(start)
     belief = check_belief(dbn, np.eye(k)[dbn._codes(start)] if start.ndim == 1 else start)
@@ -214,17 +215,6 @@ def most_probable_next(
     """
     later, weights = likely_next(dbn, codes, action, beam)
     return later[:, 0], weights[:, 0]
-
-
-def ancestors(dbn: TwoSliceDBN, action: int, factors: tuple[int, ...]) -> tuple[int, ...]:
-    """The factors of slice t+1 that `factors` depend on within that slice, with `factors` themselves."""
-    found, waiting = set(factors), list(factors)
-    while waiting:
-        for p in dbn.parents_next[action][waiting.pop()]:
-            if p not in found:
-                found.add(p)
-                waiting.append(p)
-    return tuple(sorted(found))
 
 
 def contract(potentials: Sequence[Potential], keep: tuple[int, ...]) -> np.ndarray:

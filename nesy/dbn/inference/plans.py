@@ -8,13 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from nesy.dbn.inference.exact import ancestors
-from nesy.dbn.model import TwoSliceDBN
+from nesy.dbn.inference.reachable import ancestors
 from nesy.dbn.rows import code_type, unique_rows
 from nesy.errors import UserError
+
+if TYPE_CHECKING:
+    from nesy.dbn.model import TwoSliceDBN
 
 MAX_CODES = 1 << 21
 
@@ -28,25 +31,6 @@ def cone(dbn: TwoSliceDBN, plan: Sequence[int], factors: Sequence[int]) -> list[
         needed[step] = set(ancestors(dbn, action, tuple(needed[step])))
         needed[step - 1] = {p for i in needed[step] for p in dbn.parents_now[action][i]}
     return [tuple(sorted(slice_)) for slice_ in needed]
-
-
-def reachable_values(dbn: TwoSliceDBN, start: np.ndarray, plan: Sequence[int]) -> list[tuple[np.ndarray, ...]]:
-    """Values that each factor may have after 0, 1, ..., T steps of a plan: [T + 1][N] arrays of values.
-
-    An upper bound: factors are taken as free of each other. `start` is a code, integers [N], or a belief [N, K].
-    """
-    start = np.asarray(start)
-    belief = np.eye(dbn.num_values)[dbn._codes(start)] if start.ndim == 1 else start
-    found = [tuple(np.flatnonzero(row) for row in belief)]
-    full = np.arange(dbn.num_values)
-    for action in plan:
-        later: dict[int, np.ndarray] = {}
-        for i in dbn.order:
-            sets = [later[p] if where else found[-1][p] for where, p in dbn.parents(action, i)]
-            possible = dbn.tensor(action, i)[np.ix_(*sets, full)] > 0
-            later[i] = np.flatnonzero(possible.reshape(-1, dbn.num_values).any(axis=0))
-        found.append(tuple(later[i] for i in range(dbn.num_factors)))
-    return found
 
 
 def follow(

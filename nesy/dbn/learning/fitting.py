@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nesy.dbn.checked_steps import Steps
-from nesy.dbn.learning.extraction import Marginals, marginals, with_counts
 from nesy.dbn.learning.structure import Search, learn_parents
+from nesy.dbn.learning.transitions import Marginals, marginals, with_counts
 from nesy.dbn.model import TwoSliceDBN, topological_order
 from nesy.dbn.rows import unique_rows
 

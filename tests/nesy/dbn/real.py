@@ -18,9 +18,9 @@ def real_model():
     from domains.core import load_domain
     from nesy.asp import KnowledgeBase
     from nesy.dbn.codebook import Codebook, value_meanings
-    from nesy.dbn.learning.extraction import Transitions
     from nesy.dbn.learning.fitting import from_experience
     from nesy.dbn.learning.structure import Search
+    from nesy.dbn.learning.transitions import Transitions
 
     domain = load_domain("person_following")
     environment = domain.make("crossing", 64, seed=0)

@@ -160,7 +160,7 @@ def test_distinct_rows_are_numpy_s(width):
 
 
 def test_distinct_transitions_stand_for_all():
-    from nesy.dbn.learning.extraction import with_counts
+    from nesy.dbn.learning.transitions import with_counts
 
     taken = experience()
     codes, actions, later, counts = taken.distinct()
@@ -312,7 +312,7 @@ def test_tables_are_as_large_as_their_limit_allows():
 
 
 def test_transitions_of_another_model_are_not_counted():
-    from nesy.dbn.learning.extraction import with_counts
+    from nesy.dbn.learning.transitions import with_counts
 
     dbn = from_experience(CODES, ACTIONS, LATER, num_values=2)
     for columns, message in (

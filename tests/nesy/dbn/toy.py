@@ -7,7 +7,8 @@ from typing import ClassVar
 import numpy as np
 
 from nesy.dbn.codebook import Codebook, value_meanings
-from nesy.dbn.learning.extraction import Transitions, extract
+from nesy.dbn.learning.extraction import extract
+from nesy.dbn.learning.transitions import Transitions
 from nesy.dbn.model import TwoSliceDBN
 
 
