@@ -83,7 +83,7 @@ def says_something(believed: np.ndarray) -> np.ndarray:
 class DQNAgent:
     """Acts greedily on a trained belief DQN."""
 
-    model = "none: learned values of b and b~"
+    model = "none"
 
     def __init__(self, policy: DQNPolicy) -> None:
         self.policy = policy

@@ -14,8 +14,8 @@ from nesy.report import text
 def print_comparison(cells: list[dict[str, Any]]) -> None:
     """Print the comparison."""
     table = Table(title="Comparison (95 % intervals in brackets)", title_justify="left")
-    for position, column in enumerate(text.COMPARISON_COLUMNS):
-        table.add_column(column, justify="left" if position < 4 else "right", no_wrap=True)
+    for column in text.COMPARISON_COLUMNS:
+        table.add_column(column, justify="left" if column in text.TEXT_COLUMNS else "right", no_wrap=True)
     for row in text.comparison_rows(cells):
         table.add_row(*row)
     print_wide(table)

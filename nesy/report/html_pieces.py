@@ -7,17 +7,20 @@ import json
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from nesy.report.text import flat, number
+from nesy.report.text import TEXT_COLUMNS, flat, number
 
 SHORT_CAPTION = 90
 """Letters of a caption that may be wider than its table; a longer one is broken into lines."""
 
 
 def table(columns: Sequence[str], rows: Iterable[Sequence[str]], caption: str, text_columns: int = 1) -> str:
-    """A table; its first `text_columns` columns are text, the others numbers. Everything in it is escaped."""
+    """A table; its first `text_columns` columns and `TEXT_COLUMNS` are text, the others numbers. All is escaped."""
 
     def cells(tag: str, values: Sequence[str]) -> str:
-        kinds = ["" if position < text_columns else ' class="number"' for position in range(len(values))]
+        kinds = [
+            "" if position < text_columns or column in TEXT_COLUMNS else ' class="number"'
+            for position, column in enumerate(columns)
+        ]
         return "".join(f"<{tag}{kind}>{html.escape(value)}</{tag}>" for kind, value in zip(kinds, values, strict=True))
 
     body = "\n".join(f"<tr>{cells('td', row)}</tr>" for row in rows)

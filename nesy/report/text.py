@@ -15,7 +15,13 @@ COMPARISON_COLUMNS = (
     "ms/decision",
     "learned from",
     "episodes",
+    "algorithm",
+    "model",
 )
+
+
+TEXT_COLUMNS = ("agent", "inputs", "influence", "variant", "algorithm", "model")
+"""The columns of words; the others are figures."""
 
 
 def shown(cell: dict[str, Any]) -> dict[str, Any]:
@@ -51,6 +57,8 @@ def comparison_rows(cells: list[dict[str, Any]]) -> list[tuple[str, ...]]:
                 f"{cell['episodes']} ({len(cell['seeds'])} seeds)"
                 if len(cell.get("seeds", ())) > 1
                 else str(cell["episodes"]),
+                cell.get("algorithm", ""),
+                cell.get("model", ""),
             )
         )
     return rows

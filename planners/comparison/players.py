@@ -178,7 +178,7 @@ def _reference(cell: Cell, domain: Domain, seed: int) -> Agent:
     oracles = {
         "optimum": (domain.optimum, "the world, full state"),
         "bayes-optimum": (domain.bayes_optimum, "the world, exact belief"),
-        "egocentric-optimum": (domain.egocentric_optimum, "the world, persons taken to know what the robot knows"),
+        "egocentric-optimum": (domain.egocentric_optimum, "the world, egocentric belief"),
     }
     solve, model = oracles[cell.agent]
     return OptimalAgent(solve(cell.variant).policy, model)

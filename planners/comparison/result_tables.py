@@ -19,7 +19,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from nesy.report.text import COMPARISON_COLUMNS, comparison_rows, interval, number, shown
+from nesy.report.text import COMPARISON_COLUMNS, TEXT_COLUMNS, comparison_rows, interval, number, shown
 from nesy.run_folder import atomic_path
 
 ACROSS = 5
@@ -105,8 +105,7 @@ def _latex(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     def line(cells: Sequence[str]) -> str:
         return " & ".join("".join(special.get(c, c) for c in cell) for cell in cells) + r" \\"
 
-    words = sum(column in ("agent", "inputs", "influence", "variant") for column in columns)
-    layout = "l" * words + "r" * (len(columns) - words)
+    layout = "".join("l" if column in TEXT_COLUMNS else "r" for column in columns)
     return "\n".join(
         [rf"\begin{{tabular}}{{{layout}}}", line(columns), r"\hline", *map(line, rows), r"\end{tabular}", ""]
     )

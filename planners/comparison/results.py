@@ -31,7 +31,8 @@ from planners.comparison.statistics import performance_profile, running_average
 from planners.config import ORACLES, PLANNING_AGENTS, REFERENCE_AGENTS, CompareConfig
 
 CONDITION = ("agent", "inputs", "influence", "variant")
-METRICS_OF_NO_EPISODE = ("seed", "phase", "episode", "outcome", "map_id", "step", "experience_steps", *CONDITION)
+METRICS_OF_NO_EPISODE = ("seed", "phase", "episode", "outcome", "map_id", "step", "experience_steps", "algorithm", "model",
+                         *CONDITION)  # fmt: skip
 MOST_POINTS = 400
 """Points of a stored learning curve."""
 
@@ -179,6 +180,7 @@ def _record(
     record: dict[str, Any] = dict(zip(CONDITION, (str(part) for part in condition), strict=True))
     exact = optimum if record["agent"] == "optimum" and not config.rules else None
     record |= _figures(rows, config, optimum, peer, bayes, maps, exact is not None)
+    record |= {name: str(rows[name][0]) for name in ("algorithm", "model") if name in rows}
     record["experience_steps"] = int(rows["experience_steps"].max())
     if exact is not None:
         record["exact"] = {"return": exact["mean_return"], "success": exact["success"]}

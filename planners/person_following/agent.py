@@ -17,7 +17,7 @@ ALGORITHMS = {"pomdp": "POUCT of pomdp-py", "search": "PO-UCT", "qmdp": "QMDP"}
 class PlanningAgent(BeliefAgent):
     """Keeps particles of the local model and plans with pomdp-py's POUCT, QMDP or our own search."""
 
-    model = "2DBN and influence prior (learned local model)"
+    model = "2DBN + I(u|l)"
 
     def __init__(
         self,

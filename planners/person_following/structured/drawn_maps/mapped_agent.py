@@ -99,7 +99,7 @@ class MappedAgent(BeliefAgent):
 
     acts_on_code = False
     algorithm = "one-step expectation by sampling, leaves by imagined trajectories"
-    model = "hand-structured: a map drawn on the way; learned tables"
+    model = "hand-structured: drawn map"
 
     def __init__(
         self,

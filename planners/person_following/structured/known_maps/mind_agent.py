@@ -81,7 +81,7 @@ class MindAgent(BeliefAgent):
     """Keeps an exact belief over what the person has in mind, and searches in it."""
 
     algorithm = "PO-UCT, leaves by imagined trajectories"
-    model = "hand-structured: maps met, goals and beliefs of persons; learned tables"
+    model = "hand-structured: known maps, goals"
 
     def __init__(
         self, model: MindModel, codec: Codec, influence: str, config: SearchConfig, geometry: ViewGeometry, seed: int
