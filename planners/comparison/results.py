@@ -31,8 +31,10 @@ from planners.comparison.statistics import performance_profile, running_average
 from planners.config import ORACLES, PLANNING_AGENTS, REFERENCE_AGENTS, CompareConfig
 
 CONDITION = ("agent", "inputs", "influence", "variant")
-METRICS_OF_NO_EPISODE = ("seed", "phase", "episode", "outcome", "map_id", "step", "experience_steps", "algorithm", "model",
-                         *CONDITION)  # fmt: skip
+METRICS_OF_NO_EPISODE = (
+    *CONDITION,
+    *("seed", "phase", "episode", "outcome", "map_id", "step", "experience_steps", "algorithm", "model"),
+)
 MOST_POINTS = 400
 """Points of a stored learning curve."""
 
