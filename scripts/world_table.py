@@ -1,17 +1,19 @@
 """Every world of a variant where minds matter, played by planners, learners, followers, and exact oracles.
 
-    python scripts/mind_table.py --run runs/intent [--repeats 5] [--output minds.json] [--no-oracles]
+    python scripts/world_table.py --run runs/intent [--repeats 5] [--output minds.json] [--no-oracles]
 
 A world is a map and the candidate that is the person's goal; all of them are played, so nothing is left to the draw of
 worlds: what varies from repeat to repeat is the search's own chance. Each line has the mean return over all worlds,
 weighted as they occur, with a 95 % interval over repeats (t), and, as if the worlds were a sample, one over worlds
-(bootstrap); and its paired difference to the planner with the perspective-shift prior, with the latter interval.
+(bootstrap); and its paired differences to `search` (2DBN and influence prior) and `structured` (hand-structured), both
+with the perspective-shift prior, with the latter interval.
 The run needs a comparison on its own variant (nesy run --variant intent), which leaves the tables and the policies.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import time
 from pathlib import Path
@@ -28,8 +30,8 @@ from planners.comparison.evaluation import Player
 from planners.comparison.grid import Cell
 from planners.comparison.model_store import ModelStore
 from planners.comparison.players import build_player, restored_player
+from planners.config import PLANNING_AGENTS
 
-SHIFT = "search, perspective-shift"
 _RESAMPLES = 4000
 
 
@@ -39,6 +41,7 @@ def main() -> None:
     parser.add_argument("--run", type=Path, required=True)
     parser.add_argument("--variant", help="by default that of the run")
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--agents", nargs="+", choices=PLANNING_AGENTS, default=["search", "structured"])
     parser.add_argument("--modes", nargs="+", choices=INFLUENCE_MODES, default=list(INFLUENCE_MODES))
     parser.add_argument("--output", type=Path)
     parser.add_argument("--no-oracles", action="store_true", help="leave out what takes half a minute")
@@ -46,7 +49,8 @@ def main() -> None:
     run, domain = RunFolder.open(arguments.run), load_domain()
     config = load(run.config)
     variant = arguments.variant or config.variant
-    ModelStore(run).learn(domain, variant, config.compare.search, config.seed, structured=True)
+    structured = "structured" in arguments.agents
+    ModelStore(run).learn(domain, variant, config.compare.search, config.seed, structured)
     grids, own, weights = worlds(domain, variant)
     rows: dict[str, dict[str, Any]] = {}
 
@@ -67,13 +71,13 @@ def main() -> None:
         cell = Cell("dqn", "full", influence, variant, int(seed))
         player = restored_player(cell, run, domain, config.compare, config.seed)
         add(f"dqn full, {influence}, seed {seed}", *play(domain, variant, player, grids, own))
-    for mode in arguments.modes:
+    for agent, mode in itertools.product(arguments.agents, arguments.modes):
         played = []
         for repeat in range(arguments.repeats):
-            player = build_player(Cell("search", "full", mode, variant, 0), run, domain, config.compare, repeat).player
+            player = build_player(Cell(agent, "full", mode, variant, 0), run, domain, config.compare, repeat).player
             played.append(play(domain, variant, player, grids, own))
         returns, success, milliseconds = (np.concatenate([np.atleast_2d(one[i]) for one in played]) for i in range(3))
-        add(f"search, {mode}", returns, success, float(np.median(milliseconds)))
+        add(f"{agent}, {mode}", returns, success, float(np.median(milliseconds)))
     if not arguments.no_oracles:
         for name, solve in (
             ("optimum", domain.optimum),
@@ -132,10 +136,10 @@ def table(rows: dict[str, dict[str, Any]], weights: np.ndarray) -> str:
         (float(np.mean(rows[name]["repeats"])) if name in rows else np.nan)
         for name in ("greedy-follower", "bayes-optimum")
     )
-    shift = np.array(rows[SHIFT]["returns"]) if SHIFT in rows else None
     lines = [
-        "| agent | return | over repeats | over worlds | perspective-shift is better by | success | gap closed | ms |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| agent | return | over repeats | over worlds | search, perspective-shift is better by | "
+        "structured, perspective-shift is better by | success | gap closed | ms |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for name, row in sorted(rows.items(), key=lambda item: -float(np.mean(item[1]["repeats"]))):
         repeats, returns = np.array(row["repeats"]), np.array(row["returns"])
@@ -146,11 +150,9 @@ def table(rows: dict[str, dict[str, Any]], weights: np.ndarray) -> str:
             else 0.0
         )
         cells = [f"{mean - half:.1f} to {mean + half:.1f}" if len(repeats) > 1 else "exact", _interval(drawn @ returns)]
-        cells.append(
-            ""
-            if shift is None or name == SHIFT
-            else f"{(shift - returns) @ weights:.1f} ({_interval(drawn @ (shift - returns))})"
-        )
+        cells += [
+            _better(rows, f"{agent}, perspective-shift", name, weights, drawn) for agent in ("search", "structured")
+        ]
         closed = (mean - low) / (high - low)
         cells += [
             f"{row['success']:.3f}",
@@ -159,6 +161,14 @@ def table(rows: dict[str, dict[str, Any]], weights: np.ndarray) -> str:
         ]
         lines.append(f"| {name} | {mean:.1f} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+def _better(rows: dict[str, dict[str, Any]], ours: str, theirs: str, weights: np.ndarray, drawn: np.ndarray) -> str:
+    """By how much `ours` is better than `theirs` on the same worlds, with its interval over worlds."""
+    if ours not in rows or ours == theirs:
+        return ""
+    ahead = np.array(rows[ours]["returns"]) - np.array(rows[theirs]["returns"])
+    return f"{ahead @ weights:.1f} ({_interval(drawn @ ahead)})"
 
 
 def _interval(values: np.ndarray) -> str:
