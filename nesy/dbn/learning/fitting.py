@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nesy.dbn.checked_steps import Steps
+from nesy.dbn.learning.checked_steps import Steps
 from nesy.dbn.learning.structure import Search, learn_parents
 from nesy.dbn.learning.transitions import Marginals, marginals, with_counts
 from nesy.dbn.model import TwoSliceDBN, topological_order

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nesy.checked_arrays import integers
-from nesy.dbn.checked_steps import Steps
 from nesy.dbn.codebook import Codebook
+from nesy.dbn.learning.checked_steps import Steps
 from nesy.dbn.learning.structure import Candidates, Search, learn_parents
 from nesy.dbn.model import TwoSliceDBN
 from nesy.dbn.rows import distinct_values

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nesy.checked_arrays import integers
-from nesy.dbn.checked_steps import Steps
 from nesy.dbn.codebook import distinct_views
+from nesy.dbn.learning.checked_steps import Steps
 from nesy.dbn.model import Parents, TwoSliceDBN
 from nesy.dbn.rows import unique_rows
 from nesy.errors import UserError

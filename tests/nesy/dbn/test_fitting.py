@@ -401,11 +401,11 @@ def test_outcomes_that_do_not_fit_are_refused():
 
 def test_a_codebook_holds_whole_numbers():
     codes = np.zeros((2, 1), dtype=np.uint8)
-    with pytest.raises(UserError, match="views are whole numbers"):
+    with pytest.raises(UserError, match="views of a codebook are whole numbers"):
         Codebook.build(np.full((2, 1, 1), 0.5), codes, np.ones(2), None)
-    with pytest.raises(UserError, match="views are whole numbers"):
+    with pytest.raises(UserError, match="views of a codebook are whole numbers"):
         Codebook.build(np.full((2, 1, 1), 256), codes, np.ones(2), None)
-    with pytest.raises(UserError, match="codes are whole numbers"):
+    with pytest.raises(UserError, match="codes of a codebook are whole numbers"):
         Codebook.build(np.zeros((2, 1, 1)), codes - 0.5, np.ones(2), None)
     wide = Codebook.build(np.zeros((2, 1, 1)), np.array([[1], [300]]), np.ones(2), None)
     assert wide.codes.tolist() == [[1], [300]]
