@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from domains.core import GOAL, UNSEEN
+from nesy.errors import UserError
 from planners.models.tables import DecisionTable, Parents, learn_distribution
 from planners.person_following.motion import NUM_MOVES
 from planners.person_following.structured.frames import FAR
@@ -100,6 +101,11 @@ def learn_intentions(
         shown[:, k] = shown_at(scenes, scene, person, experience.person_view, goals[:, k])
     given_up = _running_any(shown == ABSENT, begins)
     prior = scenes.goals >= 0
+    if blank := int((~prior.any(axis=1)).sum()):
+        raise UserError(
+            f"{blank} of {len(prior)} maps met have shown no goal yet, so nobody's goal can be told there; practise more "
+            "(--search.practice-episodes)"
+        )
     log_prior = np.where(prior, 0.0, -np.inf)[scene[begins]]
     # at first: whoever is not there yet takes a way that is nearer
     likely = np.where(ways[..., :3] > 0, 1.0, 0.05)
