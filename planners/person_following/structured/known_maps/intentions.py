@@ -103,7 +103,7 @@ def learn_intentions(
     prior = scenes.goals >= 0
     if blank := int((~prior.any(axis=1)).sum()):
         raise UserError(
-            f"{blank} of {len(prior)} maps met have shown no goal yet, so nobody's goal can be told there; practise more "
+            f"{blank} of {len(prior)} maps met have shown no goal yet: nobody can be told to head for one; practise more "
             "(--search.practice-episodes)"
         )
     log_prior = np.where(prior, 0.0, -np.inf)[scene[begins]]
