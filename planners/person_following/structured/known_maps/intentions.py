@@ -103,8 +103,8 @@ def learn_intentions(
     prior = scenes.goals >= 0
     if blank := int((~prior.any(axis=1)).sum()):
         raise UserError(
-            f"{blank} of {len(prior)} maps met have shown no goal yet: nobody can be told to head for one; practise more "
-            "(--search.practice-episodes)"
+            f"{blank} of {len(prior)} maps met have shown no goal yet, so nobody can be told to head for one; "
+            "practise more (--search.practice-episodes)"
         )
     log_prior = np.where(prior, 0.0, -np.inf)[scene[begins]]
     # at first: whoever is not there yet takes a way that is nearer
