@@ -27,7 +27,7 @@ import tyro
 
 from nesy.errors import UserError
 from nesy.progress import ConsoleProgress
-from nesy.report.comparison_figures import learning, optima, save
+from nesy.report.comparison_figures import exact_optima, learning, save
 from nesy.run_folder import RunFolder, read_json, write_json
 from planners.comparison.compare import compare
 from planners.comparison.statistics import over_seeds
@@ -111,7 +111,7 @@ def make(options: Arguments) -> dict[str, Any]:
         curve["name"] = next(mode for mode in options.modes if f"/ {mode} /" in curve["name"])
     bands = f"Bands: 95 % over {len(options.seeds)} seeds. World model: {result['world_model']}."
     notes = (f"{bands} {result['ranking']}", PUBLISHED)
-    save(learning(curves, optima(records), notes), options.output / "figure4")
+    save(learning(curves, exact_optima(records), notes), options.output / "figure4")
     return result
 
 

@@ -32,9 +32,10 @@ from planners.comparison.statistics import bootstrap
 from planners.config import SearchConfig
 from planners.perception import Perception
 from planners.person_following.agent import PlanningAgent
-from planners.person_following.ialm import IALM, WAIT
+from planners.person_following.ialm import IALM
 from planners.person_following.ialm_learning import learn_ialm
 from planners.person_following.influence_rules import constrain_influence
+from planners.person_following.motion import WAIT
 
 RULE = "person_forbidden(forward) :- person_now(wall_ahead)."
 

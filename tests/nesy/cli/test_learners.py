@@ -36,7 +36,7 @@ def test_the_published_learner_runs(run_copy: Path) -> None:
     from planners.dqn.dqn import DQNPolicy
 
     stored = DQNPolicy.load(policy)
-    assert stored.config == DQNConfig.published(3)
+    assert stored.config == DQNConfig.published(3).at(0.9)  # the discount of `paper`
     assert _parsed("--run", str(run_copy)) == DQNConfig.published(3)  # the run remembers
 
 

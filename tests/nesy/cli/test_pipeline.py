@@ -10,13 +10,13 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from domains import core
+from domains import worlds
 from domains.core import DomainSpec
 from domains.person_following.domain import PersonFollowing
 from nesy.cli import configuration, pipeline
 from nesy.cli.configuration import PRESETS, RunConfig
 from nesy.cli.main import main
-from nesy.report.text import comparison_rows
+from nesy.report.text import COMPARISON_COLUMNS, comparison_rows
 from tests.conftest import TINY
 
 INFLUENCES = ("random", "perspective-shift", "perfect-information")
@@ -158,7 +158,7 @@ def test_what_is_done_later_is_recorded_as_of_then(copy: Path, monkeypatch: pyte
 def test_rows_of_the_table_are_about_the_same_episodes(run: Path) -> None:
     cells = json.loads((run / "summary.json").read_text())["comparison"]
     assert {cell["episodes"] for cell in cells} == {2, 42}
-    assert {row[-1] for row in comparison_rows(cells)} == {"2"}
+    assert {row[COMPARISON_COLUMNS.index("episodes")] for row in comparison_rows(cells)} == {"2"}
     rows = pq.read_table(run / "results" / "episodes.parquet").to_pylist()
     for cell in cells:
         played = [
@@ -308,7 +308,7 @@ ELSEWHERE = _Elsewhere()
 @pytest.fixture
 def prepared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A run folder with nothing but a configuration, of another domain, variant and seed than those of the presets."""
-    monkeypatch.setitem(core._REGISTRY, "elsewhere", f"{__name__}:ELSEWHERE")
+    monkeypatch.setitem(worlds._REGISTRY, "elsewhere", f"{__name__}:ELSEWHERE")
     configuration.save(RunConfig(domain="elsewhere", variant="clean", seed=7), tmp_path / "config.json", {})
     return tmp_path
 

@@ -19,7 +19,7 @@ from planners.person_following.structured.drawn_maps.mapped_agent import MappedA
 from planners.person_following.structured.known_maps.mind_agent import MindAgent
 
 SMALL = SearchConfig(simulations=16, particles=20, practice_episodes=150)
-STRUCTURED = {"intent": MindAgent, "false_belief": MindAgent, "occluded": MappedAgent}
+STRUCTURED = {"intent": MindAgent, "occluded": MappedAgent}
 
 
 @pytest.fixture(scope="module")

@@ -225,7 +225,7 @@ def test_terminal_states_must_be_terminal() -> None:
 def test_search_plays_tiger_as_the_solver_does(method: Method) -> None:
     model = TabularPOMDP(**tiger())
     certificate = solve(model, gap=0.05, time_limit=30)
-    search = TreeSearch(model, np.random.default_rng(0), simulations=4000, depth=20, method=method)
+    search = TreeSearch(model, np.random.default_rng(0), simulations=20_000, depth=20, method=method)
     for hints in range(-3, 4):  # net number of times the tiger was heard on the left
         belief = model.start
         for _ in range(abs(hints)):
