@@ -28,6 +28,7 @@ def make(run: RunFolder, summary: dict[str, Any]) -> str:
     cells = summary["comparison"]
     parts = [
         table(COMPARISON_COLUMNS, comparison_rows(cells), f"{INTERVALS} {shared_note(cells)}".strip(), text_columns=4),
+        _deciders(cells),
         figure(
             figures.svg(comparison_figures.returns(cells)),
             "Return per episode. The optimum's policy is exact: dynamic programming over the full state.",
@@ -56,6 +57,17 @@ def make(run: RunFolder, summary: dict[str, Any]) -> str:
                 )
             )
     return "".join([*parts, _metrics(cells), _regret(run)])
+
+
+def _deciders(cells: list[dict[str, Any]]) -> str:
+    """What decided in each agent's rows, and with what model: once per agent, or per variant where that differs."""
+    columns = ("agent", "algorithm", "model")
+    said: dict[tuple[str, ...], list[str]] = {}
+    for cell in cells:
+        variants = said.setdefault(tuple(cell.get(column, "") for column in columns), [])
+        variants += [cell["variant"]] if cell["variant"] not in variants else []
+    rows = [(*key, ", ".join(variants)) for key, variants in said.items()]
+    return table((*columns, "variants"), rows, "What decides, and with what model.", text_columns=4)
 
 
 def _metrics(cells: list[dict[str, Any]]) -> str:
