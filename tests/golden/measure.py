@@ -203,5 +203,5 @@ def machine() -> dict[str, str]:
 
     import torch
 
-    names = ("torch", "numpy", "numba", "scipy", "scikit-learn")
+    names = ("torch", "numpy", "numba", "scipy")
     return {"vectors": torch.backends.cpu.get_cpu_capability(), **{name: version(name) for name in names}}
