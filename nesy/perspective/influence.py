@@ -14,8 +14,8 @@ An influence mode says where b~ comes from. It means the same for every agent th
 | `random` | one situation drawn from the base of `zero`, anew at each decision, the same throughout the belief |
 
 The hand-structured planners answer `perspective-shift` on maps of their own, without Φ. What the base is depends on y:
-all codes alike (the DQN), codes as often as others had them (the local model's particles), all candidates alike (goals),
-surroundings as often as they were met (maps drawn on the way).
+all codes alike (the DQN), codes as often as others had them (the local model's particles), all candidates alike
+(goals), surroundings as often as they were met (maps drawn on the way).
 """
 
 from __future__ import annotations
