@@ -128,6 +128,8 @@ class BeliefAgent:
 
     algorithm: str
     model: str
+    acts_on_code = True
+    """Whether it takes in the robot's code, or what it sees."""
 
     def __init__(self, geometry: ViewGeometry, seed: int) -> None:
         self.geometry, self.seed = geometry, seed

@@ -1,7 +1,10 @@
 """Certify the planners of explicit POMDPs against published values.
 
     python scripts/certify_planners.py [--problems tiger 4,4 5,5 7,8] [--episodes N] [--seconds S] [--json FILE]
+    python scripts/certify_planners.py --discounts 0.9 0.999 0.9999 0.99999
     python scripts/certify_planners.py --files FOLDER [--time-limit 10] [--gap 1e-3] [--brackets FILE.csv] [--json FILE]
+
+With `--discounts`: the solver's bounds where every step earns 1, which is worth 1 / (1 - discount).
 
 With `--files`: the solver's bounds for every .pomdp file of a folder, and whether they are in order; with `--brackets`
 (lines of file name, lower, upper; by another solver) also whether the two brackets overlap to within the gap.
@@ -76,7 +79,10 @@ def main() -> int:
     parser.add_argument("--time-limit", type=float, default=10.0, help="seconds per file")
     parser.add_argument("--gap", type=float, default=1e-3, help="of the bounds, at which a file is done")
     parser.add_argument("--brackets", type=Path, default=None, help="CSV of another solver's bounds: file,lower,upper")
+    parser.add_argument("--discounts", type=float, nargs="+", default=None, help="where every step earns 1")
     arguments = parser.parse_args()
+    if arguments.discounts:
+        return ones(arguments.discounts)
     if arguments.files:
         return sweep(arguments.files, arguments.time_limit, arguments.gap, arguments.brackets, arguments.json)
     outcomes = []
@@ -94,6 +100,32 @@ def main() -> int:
     if arguments.json:
         arguments.json.write_text(json.dumps(outcomes, indent=2) + "\n", encoding="utf-8")
     return 0 if all(outcome["passed"] for outcome in outcomes) else 1
+
+
+def ones(discounts: list[float]) -> int:
+    """Bounds where every step earns 1, one state and 30; 1 where they leave out 1 / (1 - discount)."""
+    print("| discount | states | lower | upper | relative width | seconds |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    wrong = False
+    for discount in discounts:
+        for states in (1, 30):
+            rng = np.random.default_rng(0)
+            model = TabularPOMDP(
+                states=[str(s) for s in range(states)],
+                actions=["0", "1"],
+                observations=["0", "1"],
+                transition=[rng.dirichlet(np.ones(states), states) for _ in range(2)],
+                observation=rng.dirichlet(np.ones(2), (2, states)),
+                reward=np.ones((2, states)),
+                discount=discount,
+                start=np.full(states, 1 / states),
+                terminal=np.zeros(states, bool),
+            )
+            found, value = solve(model), 1 / (1 - discount)
+            wrong |= not found.lower <= value <= found.upper
+            width = (found.upper - found.lower) / value
+            print(f"| {discount} | {states} | {found.lower!r} | {found.upper!r} | {width:.1g} | {found.seconds:.3f} |")
+    return int(wrong)
 
 
 def sweep(files: Path, time_limit: float, gap: float, brackets: Path | None, output: Path | None) -> int:

@@ -76,6 +76,10 @@ PRESETS: dict[str, RunConfig] = {
 }
 
 
+RETIRED: dict[tuple[type, str], Any] = {(SearchConfig, "mind_discount"): 0.99}
+"""Settings of older runs that are gone, with the value that means what happens now: with that they are read."""
+
+
 def save(config: RunConfig, path: Path, versions: Mapping[str, str]) -> None:
     """Write config.json atomically, with the versions of the libraries that the run uses."""
     write_json(path, {"format": FORMAT, **dataclasses.asdict(config), "versions": dict(versions)})
@@ -105,6 +109,7 @@ def _build(kind: type, value: Any, where: str) -> Any:
     """An instance of the dataclass `kind` from plain JSON values, each checked against the field's type."""
     if not isinstance(value, dict):
         raise UserError(f"{where}: expected an object with settings, found {type(value).__name__}")
+    value = {name: item for name, item in value.items() if RETIRED.get((kind, name), ...) != item}
     types_of = typing.get_type_hints(kind)
     names = [item.name for item in dataclasses.fields(kind)]
     unknown = sorted(set(value) - set(names))

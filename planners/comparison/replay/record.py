@@ -249,7 +249,7 @@ def _beliefs(player: Player, percepts: Percepts | None, believed: np.ndarray | N
     if percepts is None:
         return shown
     codec: Any = player.codec
-    if getattr(player.agent, "acts_on_code", True):
+    if not isinstance(player.agent, BeliefAgent) or player.agent.acts_on_code:
         shown["belief"] = _distributions(percepts.beliefs[i])
         shown["decoded"] = _digits(codec.views(percepts.beliefs[i : i + 1].argmax(axis=2).astype(np.uint8))[0])
     if believed is not None:

@@ -109,6 +109,19 @@ def test_configuration_round_trip(preset: str, tmp_path: Path) -> None:
     assert configuration.load(path) == configuration.PRESETS[preset]
 
 
+def test_retired_settings_are_read_where_they_mean_what_happens_now(tmp_path: Path) -> None:
+    path = tmp_path / "config.json"
+    configuration.save(configuration.PRESETS["smoke"], path, {})
+    document = json.loads(path.read_text())
+    document["compare"]["search"]["mind_discount"] = 0.99
+    path.write_text(json.dumps(document))
+    assert configuration.load(path) == configuration.PRESETS["smoke"]
+    document["compare"]["search"]["mind_discount"] = 0.5
+    path.write_text(json.dumps(document))
+    with pytest.raises(UserError, match="unknown setting 'mind_discount'"):
+        configuration.load(path)
+
+
 @pytest.mark.parametrize(
     ("change", "expected"),
     [

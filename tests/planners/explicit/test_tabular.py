@@ -153,3 +153,13 @@ def test_a_folder_of_files_is_certified_by_a_command(tmp_path: Path) -> None:
         assert "| tiger.pomdp | 2, 3, 2 | 0.95 | 19.37" in done.stdout
         assert f"| {verdict} |" in done.stdout
         assert "| refused: " in done.stdout
+
+
+def test_discounts_near_one_are_certified_by_a_command() -> None:
+    script = Path(__file__).parents[3] / "scripts" / "certify_planners.py"
+    command = [sys.executable, script, "--discounts", "0.9", "0.99999"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    widths = [float(line.split("|")[5]) for line in done.stdout.splitlines()[2:]]
+    assert len(widths) == 4
+    assert max(widths) <= 1e-6
